@@ -1,0 +1,16 @@
+"""Networks: per-frame encoder, latent dynamics, policy, and the SaLaD world model that holds them."""
+
+from __future__ import annotations
+
+from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, inward_clamp
+from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
+
+__all__ = [
+    "FrameEncoder",
+    "LatentDynamics",
+    "Policy",
+    "SaLaD",
+    "as_tensordict_module",
+    "inward_clamp",
+    "make_rollout_policy",
+]

@@ -1,0 +1,422 @@
+r"""Default networks: per-frame encoder :math:`E`, latent dynamics :math:`d` and policy :math:`\pi`.
+
+All three live on the bounded latent domain :math:`[-1, 1]^p`. Dynamics and policy are made of linear layers,
+ReLU and clamps only, so that linear bound propagation is tight on them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
+
+
+class _InwardClamp(torch.autograd.Function):
+    """Clamp to ``[-1, 1]`` whose gradient vanishes only where descent would move further out."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(value: Tensor) -> Tensor:
+        return value.clamp(-1.0, 1.0)
+
+    @staticmethod
+    def setup_context(ctx, inputs: tuple[Tensor], output: Tensor) -> None:
+        ctx.save_for_backward(inputs[0])
+
+    @staticmethod
+    def backward(ctx, grad: Tensor) -> Tensor:
+        (value,) = ctx.saved_tensors
+        outward = ((value > 1.0) & (grad < 0.0)) | ((value < -1.0) & (grad > 0.0))
+        return torch.where(outward, 0.0, grad)
+
+
+def inward_clamp(value: Tensor) -> Tensor:
+    r"""Clamps to :math:`[-1, 1]`, with a gradient that can always lead back inside.
+
+    .. math:: c(v) = \min(1, \max(-1, v)), \qquad
+        \frac{\partial \ell}{\partial v} = \begin{cases} 0 & v > 1, \partial \ell / \partial c < 0 \\
+        0 & v < -1, \partial \ell / \partial c > 0 \\ \partial \ell / \partial c & \text{else} \end{cases}
+
+    The value is the exact clamp. The gradient is the straight-through one, except that a step which would
+    move further out is dropped. An ordinary clamp (or a saturated tanh) keeps a network that has left the
+    interval stuck outside for good; the unrestricted straight-through gradient drives it further out.
+
+    Args:
+        value: any shape, floating point.
+
+    Returns:
+        The clamped tensor, same shape and dtype.
+
+    Source: none.
+
+    Example:
+        >>> value = torch.tensor([2.0, 2.0], requires_grad=True)
+        >>> (inward_clamp(value) * torch.tensor([1.0, -1.0])).sum().backward()
+        >>> value.grad  # the first entry may come down, the second must not go further up
+        tensor([1., 0.])
+    """
+    return _InwardClamp.apply(value)
+
+
+def _mlp(sizes: Sequence[int], activation: type[nn.Module] = nn.ReLU) -> nn.Sequential:
+    layers: list[nn.Module] = []
+    for inputs, outputs in pairwise(sizes):
+        layers += [nn.Linear(inputs, outputs), activation()]
+    return nn.Sequential(*layers[:-1])
+
+
+def _pair(value: int | Sequence[int], name: str) -> tuple[int, int]:
+    pair = (value, value) if isinstance(value, int) else tuple(value)
+    if len(pair) != 2 or min(pair) < 1:
+        raise ConfigError(
+            f"expected {name} to be a positive int or a pair (height, width), received {value!r}; "
+            f"for instance {name}=64"
+        )
+    return int(pair[0]), int(pair[1])
+
+
+def _positive(value: int, name: str) -> int:
+    if not isinstance(value, int) or value < 1:
+        raise ConfigError(f"expected {name} to be a positive int, received {value!r}; e.g. {name}=2")
+    return value
+
+
+def _action_scale(action_scale: float | Sequence[float] | Tensor, action_dim: int) -> Tensor:
+    scale = torch.as_tensor(action_scale, dtype=torch.float32).flatten()
+    if scale.numel() not in (1, action_dim) or not bool((scale > 0).all() & scale.isfinite().all()):
+        raise ConfigError(
+            f"expected action_scale to be one positive number or {action_dim} of them (physical units "
+            f"per unit of normalised action), received {action_scale!r}; pass the largest action"
+        )
+    return scale.expand(action_dim).clone()
+
+
+def _check_last(tensor: Tensor, size: int, name: str) -> None:
+    if tensor.shape[-1:] != (size,):
+        raise ShapeError(
+            f"expected {name} of shape (*batch, {size}), received {tuple(tensor.shape)}; "
+            f"check the sizes that the network was built with"
+        )
+
+
+class FrameEncoder(nn.Module):
+    r"""Encodes two stacked frames into a bounded latent, each frame on its own.
+
+    .. math::
+        h_t = \operatorname{CNN}(\operatorname{pool}(\text{frame}_t)), \qquad
+        z_t = \tanh(\operatorname{MLP}(h_t, k (h_t - h_{t-1}))) \in (-1, 1)^p
+
+    A siamese network needs each frame once, however many stacks it appears in (three passes instead of four
+    for a transition), and the difference of smooth features carries the velocity. Frames are pooled to about
+    32 x 32 first, which makes the weights independent of the size of the picture. Normalisation is by layer;
+    there is no running statistic, so a target network that follows the parameters misses nothing.
+
+    Args:
+        latent_dim: size p of the latent.
+        image_size: height and width of the frames in pixels; ``None`` accepts any size.
+        pool_to: height and width after average pooling.
+        channels: output channels of the stride-2 convolutions.
+        features: size of the features of one frame.
+        hidden: width of the two MLPs.
+        velocity_gain: gain k of the difference of features.
+        in_channels: colour channels of one frame.
+
+    Raises:
+        ConfigError: if a size is not a positive integer.
+
+    Source: paper eq. (7), :math:`z_i = E_\theta(\mathcal{O}_i)`; the paper does not give an architecture, and
+    its latent is unbounded.
+
+    Example:
+        >>> encoder = FrameEncoder(latent_dim=2, image_size=64)
+        >>> encoder(torch.zeros(5, 6, 64, 64, dtype=torch.uint8)).shape
+        torch.Size([5, 2])
+        >>> encoder.sequence(torch.zeros(5, 3, 3, 64, 64, dtype=torch.uint8)).shape
+        torch.Size([5, 2, 2])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        image_size: int | Sequence[int] | None = None,
+        *,
+        pool_to: int | Sequence[int] = 32,
+        channels: Sequence[int] = (16, 32, 32),
+        features: int = 16,
+        hidden: int = 128,
+        velocity_gain: float = 4.0,
+        in_channels: int = 3,
+    ) -> None:
+        super().__init__()
+        self.latent_dim = _positive(latent_dim, "latent_dim")
+        self.image_size = None if image_size is None else _pair(image_size, "image_size")
+        self.pool_to = _pair(pool_to, "pool_to")
+        self.features = _positive(features, "features")
+        self.velocity_gain = float(velocity_gain)
+        self.in_channels = _positive(in_channels, "in_channels")
+        layers: list[nn.Module] = []
+        height, width, previous = *self.pool_to, self.in_channels
+        for size in channels:
+            layers += [nn.Conv2d(previous, size, 3, stride=2, padding=1), nn.SiLU()]
+            height, width, previous = (height + 1) // 2, (width + 1) // 2, size
+        flat = height * width * previous
+        self.trunk = nn.Sequential(
+            *layers,
+            nn.Flatten(),
+            nn.LayerNorm(flat),
+            nn.Linear(flat, hidden),
+            nn.SiLU(),
+            nn.Linear(hidden, features),
+        )
+        self.latent_head = _mlp((2 * features, hidden, latent_dim), nn.SiLU)
+
+    def _check(self, frames: Tensor, channels: int, name: str) -> None:
+        height, width = self.image_size or ("H", "W")
+        expected = f"(*batch, {channels}, {height}, {width})"
+        if frames.dtype != torch.uint8:
+            raise DTypeError(
+                f"expected {name} of dtype torch.uint8 in 0..255, received {frames.dtype}; "
+                f"pass the frames as they were rendered, the encoder scales them itself"
+            )
+        wrong_size = self.image_size is not None and frames.shape[-2:] != self.image_size
+        if frames.ndim < 3 or frames.shape[-3] != channels or wrong_size:
+            raise ShapeError(
+                f"expected {name} of shape {expected}, received {tuple(frames.shape)}; channels come first, "
+                f"and image_size=None accepts any height and width"
+            )
+
+    def frames(self, frames: Tensor) -> Tensor:
+        """Encodes single frames.
+
+        Args:
+            frames: ``(*batch, 3, H, W)`` uint8.
+
+        Returns:
+            ``(*batch, features)`` float.
+
+        Raises:
+            DTypeError: if the frames are not uint8.
+            ShapeError: if channels or size do not fit.
+
+        Source: none.
+
+        Example:
+            >>> FrameEncoder(2).frames(torch.zeros(4, 3, 48, 48, dtype=torch.uint8)).shape
+            torch.Size([4, 16])
+        """
+        self._check(frames, self.in_channels, "frames")
+        batch = frames.shape[:-3]
+        flat = frames.reshape(-1, *frames.shape[-3:]).to(next(self.parameters()).dtype)
+        height, width = flat.shape[-2:]
+        if height % self.pool_to[0] == 0 and width % self.pool_to[1] == 0:
+            # The same average as the adaptive pooling, several times faster.
+            kernel = (height // self.pool_to[0], width // self.pool_to[1])
+            pooled = flat if kernel == (1, 1) else F.avg_pool2d(flat, kernel)
+        else:
+            pooled = F.adaptive_avg_pool2d(flat, self.pool_to)
+        return self.trunk(pooled / 127.5 - 1.0).reshape(*batch, self.features)
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the features of two successive frames.
+
+        Args:
+            previous: ``(*batch, features)`` of frame t-1.
+            current: ``(*batch, features)`` of frame t.
+
+        Returns:
+            ``(*batch, p)`` latent in ``[-1, 1]``.
+
+        Raises:
+            ShapeError: if the number of features does not fit.
+
+        Source: none.
+
+        Example:
+            >>> FrameEncoder(2).head(torch.zeros(4, 16), torch.zeros(4, 16)).shape
+            torch.Size([4, 2])
+        """
+        _check_last(previous, self.features, "previous")
+        _check_last(current, self.features, "current")
+        motion = self.velocity_gain * (current - previous)
+        return torch.tanh(self.latent_head(torch.cat([current, motion], -1)))
+
+    def sequence(self, frames: Tensor) -> Tensor:
+        """Latents along a sequence of frames, each frame encoded once.
+
+        Args:
+            frames: ``(*batch, T, 3, H, W)`` uint8, ``T >= 2``.
+
+        Returns:
+            ``(*batch, T - 1, p)`` latents; entry k belongs to frames k and k + 1.
+
+        Raises:
+            DTypeError: if the frames are not uint8.
+            ShapeError: if there are fewer than two frames, or channels or size do not fit.
+
+        Source: none.
+
+        Example:
+            >>> FrameEncoder(2).sequence(torch.zeros(4, 3, 3, 48, 48, dtype=torch.uint8)).shape
+            torch.Size([4, 2, 2])
+        """
+        if frames.ndim < 4 or frames.shape[-4] < 2:
+            raise ShapeError(
+                f"expected frames of shape (*batch, T, {self.in_channels}, H, W) with T >= 2, received "
+                f"{tuple(frames.shape)}; a latent needs two successive frames"
+            )
+        features = self.frames(frames)
+        return self.head(features[..., :-1, :], features[..., 1:, :])
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        """Latent of a stack of two frames.
+
+        Args:
+            pixels: ``(*batch, 6, H, W)`` uint8, frame t-1 then frame t.
+
+        Returns:
+            ``(*batch, p)`` latent in ``[-1, 1]``.
+
+        Raises:
+            DTypeError: if the pixels are not uint8.
+            ShapeError: if channels or size do not fit.
+
+        Source: paper eq. (7).
+
+        Example:
+            >>> FrameEncoder(3)(torch.zeros(6, 40, 40, dtype=torch.uint8)).shape
+            torch.Size([3])
+        """
+        self._check(pixels, 2 * self.in_channels, "pixels")
+        stacked = pixels.reshape(*pixels.shape[:-3], 2, self.in_channels, *pixels.shape[-2:])
+        return self.sequence(stacked).squeeze(-2)
+
+
+class LatentDynamics(nn.Module):
+    r"""Predicts the next latent from latent and action, on the bounded domain.
+
+    .. math:: d(z, u) = \operatorname{clamp}(z + \operatorname{net}(z, u / u_{\max}), -1, 1)
+
+    The residual form makes "nothing moves" the easy guess. See :func:`inward_clamp` for the gradient.
+
+    Args:
+        latent_dim: size p of the latent.
+        action_dim: size of the action.
+        hidden: widths of the hidden layers (ReLU).
+        action_scale: physical units per unit of normalised action, a number or one per dimension.
+
+    Raises:
+        ConfigError: if a size or the scale is not valid.
+
+    Source: paper eq. (8), third term; the paper does not give an architecture.
+
+    Example:
+        >>> dynamics = LatentDynamics(latent_dim=2, action_dim=1, action_scale=10.0)
+        >>> dynamics(torch.zeros(5, 2), torch.ones(5, 1)).shape
+        torch.Size([5, 2])
+    """
+
+    action_scale: Tensor
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        hidden: Sequence[int] = (64, 64),
+        action_scale: float | Sequence[float] | Tensor = 1.0,
+    ) -> None:
+        super().__init__()
+        self.latent_dim = _positive(latent_dim, "latent_dim")
+        self.action_dim = _positive(action_dim, "action_dim")
+        # A constant, not a statistic: nothing that a target network would have to follow.
+        self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
+        self.net = _mlp((latent_dim + action_dim, *hidden, latent_dim))
+
+    def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Next latent.
+
+        Args:
+            latent: ``(*batch, p)``.
+            action: ``(*batch, action_dim)`` in physical units.
+
+        Returns:
+            ``(*batch, p)`` in ``[-1, 1]``.
+
+        Raises:
+            ShapeError: if the last dimension of either does not fit.
+
+        Source: paper eq. (8), third term.
+
+        Example:
+            >>> LatentDynamics(2, 1)(torch.zeros(5, 2), torch.zeros(5, 1)).abs().max() <= 1
+            tensor(True)
+        """
+        _check_last(latent, self.latent_dim, "latent")
+        _check_last(action, self.action_dim, "action")
+        return inward_clamp(latent + self.net(torch.cat([latent, action / self.action_scale], -1)))
+
+
+class Policy(nn.Module):
+    r"""Deterministic bounded policy on latents.
+
+    .. math:: \pi(z) = u_{\max} \operatorname{clamp}(\operatorname{net}(z), -1, 1)
+
+    See :func:`inward_clamp` for the gradient, which does not get stuck at the limits of the action.
+
+    Args:
+        latent_dim: size p of the latent.
+        action_dim: size of the action.
+        hidden: widths of the hidden layers (ReLU).
+        action_scale: largest action in physical units, a number or one per dimension.
+
+    Raises:
+        ConfigError: if a size or the scale is not valid.
+
+    Source: paper section III-C, :math:`\pi_\theta(z_i)`; the paper does not give an architecture.
+
+    Example:
+        >>> policy = Policy(latent_dim=2, action_dim=1, action_scale=10.0)
+        >>> bool(policy(torch.randn(100, 2)).abs().max() <= 10.0)
+        True
+    """
+
+    action_scale: Tensor
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        hidden: Sequence[int] = (32, 32),
+        action_scale: float | Sequence[float] | Tensor = 1.0,
+    ) -> None:
+        super().__init__()
+        self.latent_dim = _positive(latent_dim, "latent_dim")
+        self.action_dim = _positive(action_dim, "action_dim")
+        self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
+        self.net = _mlp((latent_dim, *hidden, action_dim))
+
+    def forward(self, latent: Tensor) -> Tensor:
+        """Action.
+
+        Args:
+            latent: ``(*batch, p)``.
+
+        Returns:
+            ``(*batch, action_dim)`` in physical units.
+
+        Raises:
+            ShapeError: if the last dimension does not fit.
+
+        Source: paper section III-C.
+
+        Example:
+            >>> Policy(2, 1)(torch.zeros(5, 2)).shape
+            torch.Size([5, 1])
+        """
+        _check_last(latent, self.latent_dim, "latent")
+        return self.action_scale * inward_clamp(self.net(latent))
