@@ -1,0 +1,9 @@
+"""Batched TorchRL environments with labelled regions and pixel observations."""
+
+from __future__ import annotations
+
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.pendulum import PendulumEnv
+from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
+
+__all__ = ["GymnasiumRenderer", "PendulumEnv", "PendulumRenderer", "SafetyEnv"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ _SCREEN = 500
 _ROD = _SCREEN / 4.4  # rod length: one metre on a screen that shows 4.4 m
 _HALF_WIDTH = 0.1 * _ROD
 _CENTRE = _SCREEN // 2
-_CAP_RADIUS = 11.5  # integer radius 11, plus the half pixel by which a filled circle covers its boundary pixels
+_CAP_RADIUS = 11.5  # integer radius 11, plus the half pixel by which a filled circle covers its border
 _AXLE_RADIUS = 5.5
 _GROW = 0.5  # filled polygons cover their boundary pixels as well
 _GAUSS = 0.5 / math.sqrt(3.0)  # two-point Gauss node on [-1/2, 1/2]
@@ -29,14 +30,15 @@ class PendulumRenderer:
     """Draws pendulum frames from angles, many at a time, each pixel from its own area coverage.
 
     A pixel's colour is ``white + coverage * (rod - white)``. The coverage of the rod is the product rule
-    ``H(left) + H(right) - 1`` of its two long edges, where ``H`` is the area of a unit pixel on one side of a
-    straight line (two-point Gauss quadrature, exact for edges along the axes); the round ends replace it beyond
-    the short edges. Only the square that the rod can reach is computed.
+    ``H(left) + H(right) - 1`` of its two long edges, where ``H`` is the area of a unit pixel on one side of
+    a straight line (two-point Gauss quadrature, exact for edges along the axes); the round ends replace it
+    beyond the short edges. Only the square that the rod can reach is computed.
 
     gymnasium draws with integer coordinates, so its picture jumps as the angle moves: about 2,700 different
-    pictures in a full turn. ``snap=True`` rounds the corners of the rod exactly as it does and reproduces its
-    picture (largest error of any pixel about 12/255 over thousands of angles). ``snap=False`` draws the
-    picture that it approximates, continuous in the angle (largest error about 25/255, caused by the rounding).
+        pictures in a full turn. ``snap=True`` rounds the corners of the rod exactly as it does and
+        reproduces its picture (largest error of any pixel about 12/255 over thousands of angles).
+        ``snap=False`` draws the picture that it approximates, continuous in the angle (largest error about
+        25/255, caused by the rounding).
 
     Args:
         image_size (int): height and width of the frames, in pixels; at least 16. Default 64.
@@ -44,8 +46,7 @@ class PendulumRenderer:
         device: device of the frames. Default the device of the angles.
 
     Source: gymnasium 1.x, ``envs/classic_control/pendulum.py``; the paper (Section V-A) uses its frames.
-    Deviation: none of the torque arrow, which would show the action in the observation; it is not drawn after a
-    reset by gymnasium either.
+    Deviation: the torque arrow, which would show the action in the observation, is never drawn.
 
     Example:
         >>> import torch
@@ -77,15 +78,16 @@ class PendulumRenderer:
         distance = torch.hypot(dx, dy)
         self._pivot = (distance < _CAP_RADIUS * scale).float().mean((-1, -2))
         axle = (distance < _AXLE_RADIUS * scale).float().mean((-1, -2))
-        # White where nothing is drawn; black replaces the rod's colour (not white) under the axle. + 0.5 rounds.
+        # White where nothing is drawn; black replaces the rod's colour (not white) under the axle. + 0.5
+        # rounds.
         self._ground = [white + 0.5 - rod * axle for white, rod in zip(BACKGROUND, ROD_COLOUR, strict=True)]
 
     def __call__(self, angle: Tensor) -> Tensor:
         """Draw the frames of a batch of angles.
 
         Args:
-            angle (Tensor): ``(*batch,)`` or ``(*batch, 1)`` is not squeezed; floating point, rad, 0 is upright,
-                positive is counter-clockwise.
+            angle (Tensor): ``(*batch,)``, floating point, rad; 0 is upright, positive is
+                counter-clockwise.
 
         Returns:
             Tensor: uint8 ``(*batch, 3, image_size, image_size)``.
@@ -95,10 +97,12 @@ class PendulumRenderer:
             NonFiniteError: an angle is NaN or infinite.
         """
         if not angle.is_floating_point():
-            raise DTypeError(f"angle: expected a floating-point tensor, received {angle.dtype}; call .float().")
+            raise DTypeError(f"angle: expected floating point, received {angle.dtype}; call .float().")
         if not torch.isfinite(angle).all():
             bad = int((~torch.isfinite(angle)).sum())
-            raise NonFiniteError(f"angle: expected finite values, received {bad} NaN or infinite of {angle.numel()}.")
+            raise NonFiniteError(
+                f"angle: expected finite values, received {bad} of {angle.numel()} NaN or infinite."
+            )
         flat = angle.detach().reshape(-1).to(self._x.device)
         size = self.image_size
         frames = torch.full((flat.shape[0], 3, size, size), 255, dtype=torch.uint8, device=self._x.device)
@@ -114,7 +118,7 @@ class PendulumRenderer:
         return frames.reshape(*angle.shape, 3, size, size)
 
     def _corners(self, angle: Tensor) -> tuple[Tensor, Tensor]:
-        """Corners ``(n, 4, 2)`` of the rod and the centre ``(n, 2)`` of the cap at its end, in screen pixels."""
+        """Corners ``(n, 4, 2)`` of the rod and centre ``(n, 2)`` of the cap at its end, in screen pixels."""
         turned = angle.double() + math.pi / 2  # double: which side of a pixel border decides the rounding
         cos, sin = turned.cos(), turned.sin()
         points = torch.tensor(
@@ -133,9 +137,9 @@ class PendulumRenderer:
     def _edge(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Line through two points as ``column + row``: the signed distance that a box filter sees, plus 1/2.
 
-        The distance (positive on the left of ``start -> end``) is divided by the larger component of the normal,
-        so that ``clamp(column + row, 0, 1)`` is the covered part of a segment through the pixel along that axis;
-        the third result shifts the segment to the two Gauss nodes across it.
+        The distance (positive on the left of ``start -> end``) is divided by the larger component of the
+        normal, so that ``clamp(column + row, 0, 1)`` is the covered part of a segment through the pixel
+        along that axis; the third result shifts the segment to the two Gauss nodes across it.
         """
         direction = end - start
         normal = torch.stack([-direction[:, 1], direction[:, 0]], dim=-1)
@@ -162,8 +166,8 @@ class PendulumRenderer:
         radius = _CAP_RADIUS * self._scale
         radius = radius - 1 / (24 * radius)
         centre = tip * self._scale
-        distance = (self._x - centre[:, :1]).square()[:, None] + (self._y - centre[:, 1:]).square()[:, :, None]
-        cap = distance.sqrt_().neg_().add_(radius + 0.5).clamp_(0, 1)
+        across, up = (self._x - centre[:, :1]).square(), (self._y - centre[:, 1:]).square()
+        cap = (across[:, None, :] + up[:, :, None]).sqrt_().neg_().add_(radius + 0.5).clamp_(0, 1)
         column, row, _ = self._edge(d, c)
         coverage = torch.lerp(cap, coverage, (column + row).clamp_(0, 1))
         column, row, _ = self._edge(b, a)
@@ -171,11 +175,11 @@ class PendulumRenderer:
 
 
 class GymnasiumRenderer:
-    """Frames drawn by gymnasium's own Pendulum-v1 renderer and area-averaged, for evaluation on foreign pixels.
+    """Frames drawn by gymnasium's own Pendulum-v1 renderer and area-averaged, for evaluation.
 
-    gymnasium's picture is constant between the angles at which a corner of the rod crosses a whole pixel. Those
-    angles are known in closed form, so every different picture is drawn by gymnasium once (about 3 ms), kept, and
-    looked up afterwards; all of them together (about 3,000) take 36 MB at 64 x 64.
+    gymnasium's picture is constant between the angles at which a corner of the rod crosses a whole pixel.
+    Those angles are known in closed form, so every different picture is drawn by gymnasium once (about 3
+    ms), kept, and looked up afterwards; all of them together (about 3,000) take 36 MB at 64 x 64.
 
     Args:
         image_size (int): height and width of the frames, in pixels. Default 64.
@@ -192,6 +196,7 @@ class GymnasiumRenderer:
     """
 
     def __init__(self, image_size: int = 64) -> None:
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")  # no greeting on standard output
         try:
             import pygame.gfxdraw  # noqa: F401
         except ImportError as error:
@@ -224,15 +229,19 @@ class GymnasiumRenderer:
         # Cell k lies between border k and border k + 1; before the first border begins the last cell.
         cell = (torch.searchsorted(self._borders, wrapped, right=True) - 1) % self._borders.shape[0]
         for k in cell[~self._known[cell]].unique().tolist():
-            low = self._borders[k].item()
-            high = self._borders[k + 1].item() if k + 1 < len(self._borders) else self._borders[0].item() + turn
-            self._frames[k] = self._draw((low + high) / 2)
+            last = k + 1 == len(self._borders)
+            width = (
+                self._borders[0] + turn - self._borders[k]
+                if last
+                else self._borders[k + 1] - self._borders[k]
+            )
+            self._frames[k] = self._draw(float(self._borders[k] + width / 2))
             self._known[k] = True
         size = self.image_size
         return self._frames[cell].reshape(*angle.shape, 3, size, size).to(angle.device)
 
     def draw(self, angle: Tensor) -> Tensor:
-        """Draw every frame anew, without the table: ``(n,)`` rad -> uint8 ``(n, 3, image_size, image_size)``."""
+        """Draw every frame anew, without the table: ``(n,)`` rad -> uint8 ``(n, 3, H, W)``."""
         return torch.stack([self._draw(value) for value in angle.double().reshape(-1).tolist()])
 
     def _draw(self, angle: float) -> Tensor:
@@ -248,8 +257,8 @@ class GymnasiumRenderer:
 def _picture_borders() -> Tensor:
     """Sorted angles in [0, 2 pi) at which a coordinate of gymnasium's rod passes a whole pixel."""
     borders = []
-    for along, across in ((0, -1), (0, 1), (_ROD, 1), (_ROD, -1), (_ROD, 0)):
-        across = across * _HALF_WIDTH
+    for along, side in ((0, -1), (0, 1), (_ROD, 1), (_ROD, -1), (_ROD, 0)):
+        across = side * _HALF_WIDTH
         radius, phase = math.hypot(along, across), math.atan2(across, along)
         reach = math.floor(radius)
         whole = torch.arange(-reach, reach + 1, dtype=torch.float64) / radius

@@ -1,0 +1,292 @@
+"""The part that all environments share: states, regions, frames, resets and specs."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
+from torchrl_sspl.sets import UNSAFE, Region, check_disjoint, label
+
+
+def check_tensor(name: str, value: Tensor, dim: int) -> None:
+    """Raise unless ``value`` is a finite floating-point tensor ``(*batch, dim)``.
+
+    Raises:
+        ShapeError: the last dimension is not ``dim``.
+        DTypeError: the dtype is not floating point.
+        NonFiniteError: an entry is NaN or infinite.
+    """
+    if not isinstance(value, Tensor) or not value.is_floating_point():
+        found = value.dtype if isinstance(value, Tensor) else type(value).__name__
+        raise DTypeError(f"{name}: expected a floating-point tensor, received {found}; call .float().")
+    if value.ndim < 1 or value.shape[-1] != dim:
+        raise ShapeError(f"{name}: expected shape (*batch, {dim}), received {tuple(value.shape)}.")
+    if not torch.isfinite(value).all():
+        rows = int((~torch.isfinite(value)).reshape(-1, dim).any(-1).sum())
+        raise NonFiniteError(
+            f"{name}: expected finite values, received NaN or infinity in {rows} of "
+            f"{value.numel() // dim} rows; remove them."
+        )
+
+
+def check_positive(**values: float) -> None:
+    """Raise a ``ConfigError`` that names the first value that is not a positive finite number."""
+    for name, value in values.items():
+        if not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
+            raise ConfigError(f"{name}: expected a positive finite number, received {value!r}.")
+
+
+class SafetyEnv(EnvBase):
+    """A batched system with labelled regions that is seen through two consecutive frames.
+
+    A subclass gives the physics and the picture: ``dynamics``, ``wrap``, ``previous_state`` and ``draw``.
+    This class gives the TorchRL environment. Output keys, for ``batch_size=[n]``:
+
+    ========== ============================== ============================================================
+    key        shape, dtype                   meaning
+    ========== ============================== ============================================================
+    pixels     ``(n, 6, H, W)`` uint8         RGB frame of step t-1, then RGB frame of step t
+    state      ``(n, state_dim)`` float32     true state, wrapped; for evaluation, training does not need it
+    region     ``(n, 1)`` int64               0 unlabelled, 1 safe, 2 unsafe
+    reward     ``(n, 1)`` float32             -1 in the unsafe set, else 0
+    terminated ``(n, 1)`` bool                the state has left the state space
+    truncated  ``(n, 1)`` bool                ``horizon`` steps have passed since the reset
+    ========== ============================== ============================================================
+
+    ``reset()`` draws states uniformly from ``initial_set``; ``reset(TensorDict({"state": x}, [n]),
+    set_state=True)`` starts at given states. Rollouts carry the previous frame, so nothing is drawn twice.
+
+    Args:
+        state_dim, action_dim (int): dimensions of the state and of the action.
+        max_action (float): largest absolute value of an action component, in its physical unit.
+        safe_set, unsafe_set, state_space (Region): labelled sets and the set of all states, in state units.
+        exit_region (int): region label of a state outside the state space. Default ``UNSAFE``.
+        initial_set (Region): where episodes start. Default the state space.
+        batch_size (sequence of int): one entry ``[n]``, or ``[]`` for a single system.
+        image_size (int): height and width H = W of the frames.
+        horizon (int, optional): steps after which an episode is truncated. Default None: never.
+        device, seed: device and seed of the environment's own random generator.
+
+    Raises:
+        ConfigError: a parameter is not valid.
+        OverlapError: the safe and the unsafe set share states.
+    """
+
+    _supports_set_state = True
+
+    def __init__(
+        self,
+        *,
+        state_dim: int,
+        action_dim: int,
+        max_action: float,
+        safe_set: Region,
+        unsafe_set: Region,
+        state_space: Region,
+        exit_region: int = UNSAFE,
+        initial_set: Region | None = None,
+        batch_size: Sequence[int] = (1,),
+        image_size: int = 64,
+        horizon: int | None = None,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+    ) -> None:
+        batch_size = torch.Size([batch_size]) if isinstance(batch_size, int) else torch.Size(batch_size)
+        if len(batch_size) > 1 or any(n < 1 for n in batch_size):
+            raise ConfigError(f"batch_size: expected [n] with n >= 1, or [], received {list(batch_size)}.")
+        if horizon is not None and (not isinstance(horizon, int) or horizon < 1):
+            raise ConfigError(f"horizon: expected an integer >= 1 or None, received {horizon!r}.")
+        check_positive(max_action=max_action)
+        super().__init__(device=torch.device(device or "cpu"), batch_size=batch_size)
+        self.state_dim, self.action_dim, self.max_action = state_dim, action_dim, float(max_action)
+        self.safe_set, self.unsafe_set, self.state_space = safe_set, unsafe_set, state_space
+        check_disjoint(safe_set, unsafe_set)
+        self.exit_region = exit_region
+        self.initial_set = state_space if initial_set is None else initial_set
+        self.image_size, self.horizon = image_size, horizon
+        self._make_specs()
+        self._generator = torch.Generator(device=self.device)
+        if seed is None:
+            self._generator.seed()
+        else:
+            self.set_seed(seed)
+        n = batch_size.numel()
+        self._state = torch.zeros(n, state_dim, device=self.device)
+        self._frame = torch.zeros(n, 3, image_size, image_size, dtype=torch.uint8, device=self.device)
+        self._steps = torch.zeros(n, dtype=torch.int64, device=self.device)
+
+    # -- what a system defines -------------------------------------------------------------------------------
+
+    @abstractmethod
+    def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
+        """Next state ``(*batch, state_dim)``, not wrapped; actions beyond the bounds are clamped to them."""
+
+    @abstractmethod
+    def wrap(self, state: Tensor) -> Tensor:
+        """State with its periodic coordinates in [-pi, pi)."""
+
+    @abstractmethod
+    def previous_state(self, state: Tensor) -> Tensor:
+        """State one step earlier, as far as the frame of that step depends on it."""
+
+    @abstractmethod
+    def draw(self, state: Tensor) -> Tensor:
+        """One RGB frame per state, uint8 ``(n, 3, H, W)``."""
+
+    # -- what follows from it --------------------------------------------------------------------------------
+
+    def observe(self, state: Tensor, previous_state: Tensor | None = None) -> Tensor:
+        """Two stacked frames of given states.
+
+        Args:
+            state (Tensor): ``(n, state_dim)``, floating point, in physical units.
+            previous_state (Tensor, optional): ``(n, state_dim)``, the state one step earlier. Default: the
+                state that ``previous_state(state)`` reconstructs.
+
+        Returns:
+            Tensor: uint8 ``(n, 6, H, W)``, frame t-1 (RGB), then frame t (RGB).
+
+        Raises:
+            ShapeError, DTypeError, NonFiniteError: ``state`` is not a finite ``(n, state_dim)`` tensor.
+        """
+        check_tensor("state", state, self.state_dim)
+        if previous_state is None:
+            previous_state = self.previous_state(state)
+        else:
+            check_tensor("previous_state", previous_state, self.state_dim)
+            if previous_state.shape != state.shape:
+                raise ShapeError(
+                    f"previous_state: expected the shape of state {tuple(state.shape)}, "
+                    f"received {tuple(previous_state.shape)}."
+                )
+        return torch.cat([self.draw(previous_state), self.draw(state)], dim=-3)
+
+    def region(self, state: Tensor) -> Tensor:
+        """Region label int64 ``(*batch, 1)`` of states ``(*batch, state_dim)``; see ``exit_region``."""
+        check_tensor("state", state, self.state_dim)
+        codes = label(state, self.safe_set, self.unsafe_set)
+        outside = ~self.state_space.contains(state)
+        return torch.where(outside.unsqueeze(-1), torch.full_like(codes, self.exit_region), codes)
+
+    def sample_states(
+        self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None
+    ) -> Tensor:
+        """Draw ``(n, state_dim)`` states uniformly from a region, by default from ``initial_set``.
+
+        Args:
+            n (int): number of states.
+            generator (torch.Generator, optional): default the environment's own.
+            region (Region, optional): where to draw from, for example ``env.safe_set``.
+        """
+        chosen = self.initial_set if region is None else region
+        return chosen.sample(n, generator=generator or self._generator, device=self.device)
+
+    @property
+    def action_low(self) -> Tensor:
+        """Smallest action ``(action_dim,)``."""
+        return torch.full((self.action_dim,), -self.max_action, device=self.device)
+
+    @property
+    def action_high(self) -> Tensor:
+        """Largest action ``(action_dim,)``."""
+        return torch.full((self.action_dim,), self.max_action, device=self.device)
+
+    def clamp_action(self, action: Tensor) -> Tensor:
+        """Check an action ``(*batch, action_dim)`` and clamp it to the bounds."""
+        check_tensor("action", action, self.action_dim)
+        return action.clamp(-self.max_action, self.max_action)
+
+    # -- TorchRL ---------------------------------------------------------------------------------------------
+
+    def _make_specs(self) -> None:
+        shape, device = self.batch_size, self.device
+        size = self.image_size
+        self.observation_spec = Composite(
+            pixels=Bounded(0, 255, shape=(*shape, 6, size, size), dtype=torch.uint8, device=device),
+            state=Unbounded(shape=(*shape, self.state_dim), dtype=torch.float32, device=device),
+            region=Categorical(3, shape=(*shape, 1), dtype=torch.int64, device=device),
+            shape=shape,
+            device=device,
+        )
+        self.action_spec = Bounded(
+            -self.max_action,
+            self.max_action,
+            shape=(*shape, self.action_dim),
+            dtype=torch.float32,
+            device=device,
+        )
+        self.reward_spec = Unbounded(shape=(*shape, 1), dtype=torch.float32, device=device)
+        done = Binary(shape=(*shape, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            done=done.clone(), terminated=done.clone(), truncated=done.clone(), shape=shape, device=device
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is None:
+            self._generator.seed()
+        else:
+            self._generator.manual_seed(seed)
+
+    def _reset(
+        self, tensordict: TensorDictBase | None, *, set_state: bool = False, **_: Any
+    ) -> TensorDictBase:
+        n = self._state.shape[0]
+        rows = torch.arange(n, device=self.device)
+        if tensordict is not None and "_reset" in tensordict:
+            rows = rows[tensordict["_reset"].reshape(n)]
+        if set_state:
+            if tensordict is None or "state" not in tensordict:
+                raise ConfigError(
+                    "reset(set_state=True): expected key 'state' in the tensordict, found none."
+                )
+            given = tensordict["state"].to(self.device, torch.float32)
+            check_tensor("state", given, self.state_dim)
+            state = self.wrap(given.reshape(n, self.state_dim)[rows])
+        else:
+            state = self.wrap(self.sample_states(rows.shape[0]).to(torch.float32))
+        previous = self._frame.clone()
+        pixels = self.observe(state)
+        self._state[rows] = state
+        self._frame[rows] = pixels[:, 3:]
+        self._steps[rows] = 0
+        previous[rows] = pixels[:, :3]
+        return self._output(previous)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        action = tensordict["action"].reshape(-1, self.action_dim)
+        self._state = self.wrap(self.dynamics(self._state, action))
+        previous, self._frame = self._frame, self.draw(self._state)
+        self._steps = self._steps + 1
+        out = self._output(previous)
+        shape = (*self.batch_size, 1)
+        terminated = ~self.state_space.contains(self._state).reshape(shape)
+        truncated = torch.zeros_like(terminated)
+        if self.horizon is not None:
+            truncated = (self._steps >= self.horizon).reshape(shape)
+        out["reward"] = -(out["region"] == UNSAFE).float()
+        out["terminated"], out["truncated"], out["done"] = terminated, truncated, terminated | truncated
+        return out
+
+    def _output(self, previous_frame: Tensor) -> TensorDict:
+        shape, size = self.batch_size, self.image_size
+        return TensorDict(
+            {
+                "pixels": torch.cat([previous_frame, self._frame], dim=1).reshape(*shape, 6, size, size),
+                "state": self._state.clone().reshape(*shape, self.state_dim),
+                "region": self.region(self._state).reshape(*shape, 1),
+            },
+            batch_size=shape,
+            device=self.device,
+        )
+
+
+__all__ = ["SafetyEnv", "check_positive", "check_tensor"]

@@ -1,0 +1,203 @@
+"""The inverted pendulum of the paper's first case study, seen through gymnasium's picture of it."""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
+from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.sets import Box, Region
+
+INTEGRATORS = ("semi_implicit", "explicit")
+
+
+class PendulumEnv(SafetyEnv):
+    r"""Batched torque-driven pendulum with two stacked RGB frames as observation.
+
+    With the angle theta (0 upright, positive counter-clockwise) and the torque u, one step is
+
+        thetadot' = thetadot + (g / l sin theta + u / (m l^2)) dt
+        theta'    = theta + thetadot' dt        (``integrator="semi_implicit"``, as gymnasium integrates)
+        theta'    = theta + thetadot dt         (``integrator="explicit"``, the paper's formula)
+
+    With the semi-implicit step, theta_t - theta_{t-1} = thetadot_t dt: two frames determine the state. With
+    the explicit one the two frames show thetadot_{t-1}; thetadot_t then differs by the unseen torque of the
+    last step, +- max_torque dt / (m l^2) = +- 0.5 rad/s for the defaults, whatever the encoder.
+
+    Regions, in (rad, rad/s): X = [-pi, pi] x [-3.5, 3.5] (theta is an angle: -pi and pi are the same
+    state), S = [-pi/12, pi/12] x [-0.25, 0.25], U = X without [-pi/2, pi/2] x [-1.5, 1.5]. A state whose
+    speed leaves X ends the episode and counts as unsafe. Output keys: see ``SafetyEnv``.
+
+    Args:
+        batch_size (sequence of int): ``[n]`` pendulums, or ``[]`` for one. Default ``[1]``.
+        image_size (int): height and width of the frames. Default 64.
+        integrator (str): ``"semi_implicit"`` (default) or ``"explicit"``.
+        max_torque (float): bound of ``|u|`` in N m. Default 10.
+        mass, length, gravity (float): in kg, m, m/s^2. Default 1, 1, 10.
+        dt (float): time step in s. Default 0.05.
+        horizon (int, optional): steps after which an episode is truncated. Default None: never.
+        snap (bool): draw with gymnasium's whole-pixel corners (default) or continuously in the angle; see
+            ``PendulumRenderer``.
+        safe_set, unsafe_set, state_space, initial_set (Region, optional): in place of S, U, X; episodes
+            start in ``initial_set``, by default all of X.
+        device, seed: device, and seed of the environment's own random generator.
+
+    Raises:
+        ConfigError: an unknown integrator, or a parameter that is not positive.
+        OverlapError: the safe and the unsafe set share states.
+
+    Source: paper, Section V-A. Deviation: the semi-implicit step is the default (see above).
+
+    Example:
+        >>> import torch
+        >>> env = PendulumEnv(batch_size=[2], seed=0)
+        >>> env.dynamics(torch.tensor([[0.0, 1.0]]), torch.tensor([[10.0]]))
+        tensor([[0.0750, 1.5000]])
+        >>> rollout = env.rollout(3, break_when_any_done=False)
+        >>> rollout["pixels"].shape, rollout["pixels"].dtype
+        (torch.Size([2, 3, 6, 64, 64]), torch.uint8)
+    """
+
+    def __init__(
+        self,
+        batch_size: Sequence[int] = (1,),
+        image_size: int = 64,
+        integrator: str = "semi_implicit",
+        max_torque: float = 10.0,
+        *,
+        mass: float = 1.0,
+        length: float = 1.0,
+        gravity: float = 10.0,
+        dt: float = 0.05,
+        horizon: int | None = None,
+        snap: bool = True,
+        safe_set: Region | None = None,
+        unsafe_set: Region | None = None,
+        state_space: Region | None = None,
+        initial_set: Region | None = None,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+    ) -> None:
+        if integrator not in INTEGRATORS:
+            raise ConfigError(f"integrator: expected one of {list(INTEGRATORS)}, received {integrator!r}.")
+        check_positive(max_torque=max_torque, mass=mass, length=length, gravity=gravity, dt=dt)
+        renderer = PendulumRenderer(image_size, snap=snap, device=device)
+        turn = [2 * math.pi, 0.0]
+        if state_space is None:
+            state_space = Box([-math.pi, -3.5], [math.pi, 3.5], period=turn)
+        if safe_set is None:
+            safe_set = Box([-math.pi / 12, -0.25], [math.pi / 12, 0.25], period=turn)
+        if unsafe_set is None:
+            unsafe_set = state_space - Box([-math.pi / 2, -1.5], [math.pi / 2, 1.5], period=turn)
+        super().__init__(
+            state_dim=2,
+            action_dim=1,
+            max_action=max_torque,
+            safe_set=safe_set,
+            unsafe_set=unsafe_set,
+            state_space=state_space,
+            initial_set=initial_set,
+            batch_size=batch_size,
+            image_size=image_size,
+            horizon=horizon,
+            device=device,
+            seed=seed,
+        )
+        self.integrator, self.max_torque = integrator, float(max_torque)
+        self.mass, self.length, self.gravity, self.dt = mass, length, gravity, dt
+        self._renderer = renderer
+
+    def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
+        """One step of the pendulum; the formula is in the class docstring.
+
+        Args:
+            state (Tensor): ``(*batch, 2)``, floating point, (rad, rad/s).
+            action (Tensor): ``(*batch, 1)`` torque in N m; clamped to ``max_torque``, as gymnasium does.
+
+        Returns:
+            Tensor: ``(*batch, 2)``; the angle is not wrapped, see ``wrap``.
+
+        Raises:
+            ShapeError, DTypeError, NonFiniteError: an argument is not a finite tensor of the expected shape.
+
+        Source: paper, Section V-A (``integrator="explicit"``). Deviation: the semi-implicit default.
+        """
+        check_tensor("state", state, 2)
+        action = self.clamp_action(action)
+        angle, speed = state[..., :1], state[..., 1:]
+        inertia = self.mass * self.length**2
+        new_speed = speed + (self.gravity / self.length * angle.sin() + action / inertia) * self.dt
+        moved_by = new_speed if self.integrator == "semi_implicit" else speed
+        return torch.cat([angle + moved_by * self.dt, new_speed], dim=-1)
+
+    def wrap(self, state: Tensor) -> Tensor:
+        """State with its angle in [-pi, pi), ``(*batch, 2) -> (*batch, 2)``."""
+        angle = torch.remainder(state[..., :1] + math.pi, 2 * math.pi) - math.pi
+        return torch.cat([angle, state[..., 1:]], dim=-1)
+
+    def previous_state(self, state: Tensor) -> Tensor:
+        """State one step earlier under zero torque, ``(*batch, 2) -> (*batch, 2)``.
+
+        For the semi-implicit step its angle is exact for every torque: theta - thetadot dt. For the
+        explicit step it is one of the angles that the unseen torque allows, a range of +- max_torque dt^2 /
+        (m l^2).
+        """
+        check_tensor("state", state, 2)
+        angle, speed = state[..., :1], state[..., 1:]
+        pull = self.gravity / self.length * self.dt
+        if self.integrator == "semi_implicit":
+            before = angle - speed * self.dt
+            return torch.cat([before, speed - pull * before.sin()], dim=-1)
+        before = angle
+        for _ in range(8):  # fixed point of theta_t - (thetadot_t - pull sin theta) dt, a contraction
+            before = angle - (speed - pull * before.sin()) * self.dt
+        return torch.cat([before, speed - pull * before.sin()], dim=-1)
+
+    def draw(self, state: Tensor) -> Tensor:
+        """RGB frames of states, ``(*batch, 2) -> uint8 (*batch, 3, H, W)``."""
+        return self.render_frame(state[..., 0])
+
+    def render_frame(self, angle: Tensor) -> Tensor:
+        """RGB frames of angles, ``(n,)`` rad -> uint8 ``(n, 3, H, W)``; see ``PendulumRenderer``."""
+        return self._renderer(angle)
+
+    def observe_gymnasium(self, state: Tensor, previous_state: Tensor | None = None) -> Tensor:
+        """Observe as ``observe`` does, with every frame drawn by gymnasium's own Pendulum-v1 renderer.
+
+        Different pictures are drawn once (about 3 ms each) and kept; see ``GymnasiumRenderer``.
+
+        Args:
+            state (Tensor): ``(n, 2)``, (rad, rad/s).
+            previous_state (Tensor, optional): as for ``observe``.
+
+        Returns:
+            Tensor: uint8 ``(n, 6, H, W)``.
+
+        Raises:
+            MissingDependencyError: pygame is not installed.
+            ShapeError, DTypeError, NonFiniteError: the states are not finite ``(n, 2)`` tensors.
+        """
+        check_tensor("state", state, 2)
+        before = self.previous_state(state) if previous_state is None else previous_state
+        check_tensor("previous_state", before, 2)
+        if before.shape != state.shape:
+            raise ShapeError(
+                f"previous_state: expected shape {tuple(state.shape)}, received {tuple(before.shape)}."
+            )
+        renderer = _gymnasium_renderer(self.image_size)
+        return torch.cat([renderer(before[..., 0]), renderer(state[..., 0])], dim=-3)
+
+
+@functools.lru_cache(maxsize=4)
+def _gymnasium_renderer(image_size: int) -> GymnasiumRenderer:
+    """One table of gymnasium's pictures per frame size, shared by all environments of the process."""
+    return GymnasiumRenderer(image_size)
+
+
+__all__ = ["INTEGRATORS", "PendulumEnv"]
