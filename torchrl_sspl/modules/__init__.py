@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, inward_clamp
+from torchrl_sspl.modules.networks import (
+    FrameEncoder,
+    InverseDynamics,
+    LatentDynamics,
+    Policy,
+    inward_clamp,
+)
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
 
 __all__ = [
     "FrameEncoder",
+    "InverseDynamics",
     "LatentDynamics",
     "Policy",
     "SaLaD",

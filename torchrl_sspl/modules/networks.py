@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -212,7 +213,9 @@ class FrameEncoder(nn.Module):
         """
         self._check(frames, self.in_channels, "frames")
         batch = frames.shape[:-3]
-        flat = frames.reshape(-1, *frames.shape[-3:]).to(next(self.parameters()).dtype)
+        # Not next(self.parameters()): a delayed copy of the weights has none.
+        dtype = cast(Tensor, self.latent_head[0].weight).dtype
+        flat = frames.reshape(-1, *frames.shape[-3:]).to(dtype)
         height, width = flat.shape[-2:]
         if height % self.pool_to[0] == 0 and width % self.pool_to[1] == 0:
             # The same average as the adaptive pooling, several times faster.
@@ -420,3 +423,65 @@ class Policy(nn.Module):
         """
         _check_last(latent, self.latent_dim, "latent")
         return self.action_scale * inward_clamp(self.net(latent))
+
+
+class InverseDynamics(nn.Module):
+    r"""Reads the action from two successive latents; a training aid that is not deployed.
+
+    .. math:: \hat u = u_{\max} \operatorname{net}(z_t, z_{t+1})
+
+    A latent from which the action can be read has to keep what the action changes (here: velocities).
+
+    Args:
+        latent_dim: size p of the latent.
+        action_dim: size of the action.
+        hidden: widths of the hidden layers (ReLU).
+        action_scale: physical units per unit of normalised action, a number or one per dimension.
+
+    Raises:
+        ConfigError: if a size or the scale is not valid.
+
+    Source: none (the paper has no such term).
+
+    Example:
+        >>> InverseDynamics(2, 1)(torch.zeros(5, 2), torch.zeros(5, 2)).shape
+        torch.Size([5, 1])
+    """
+
+    action_scale: Tensor
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        hidden: Sequence[int] = (64, 64),
+        action_scale: float | Sequence[float] | Tensor = 1.0,
+    ) -> None:
+        super().__init__()
+        self.latent_dim = _positive(latent_dim, "latent_dim")
+        self.action_dim = _positive(action_dim, "action_dim")
+        self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
+        self.net = _mlp((2 * latent_dim, *hidden, action_dim))
+
+    def forward(self, latent: Tensor, next_latent: Tensor) -> Tensor:
+        """Estimated action.
+
+        Args:
+            latent: ``(*batch, p)``.
+            next_latent: ``(*batch, p)``.
+
+        Returns:
+            ``(*batch, action_dim)`` in physical units.
+
+        Raises:
+            ShapeError: if the last dimension of either does not fit.
+
+        Source: none.
+
+        Example:
+            >>> InverseDynamics(2, 1)(torch.zeros(5, 2), torch.zeros(5, 2)).shape
+            torch.Size([5, 1])
+        """
+        _check_last(latent, self.latent_dim, "latent")
+        _check_last(next_latent, self.latent_dim, "next_latent")
+        return self.action_scale * self.net(torch.cat([latent, next_latent], -1))

@@ -1,0 +1,19 @@
+"""Losses as TorchRL loss modules."""
+
+from __future__ import annotations
+
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
+from torchrl_sspl.objectives.deviation import PolicyDeviationLoss
+from torchrl_sspl.objectives.salad import SaLaDLoss
+from torchrl_sspl.objectives.sspl import PRESETS, SSPLLoss
+from torchrl_sspl.objectives.synthesis import SynthesisLoss
+
+__all__ = [
+    "PRESETS",
+    "LatentBatch",
+    "LatentLoss",
+    "PolicyDeviationLoss",
+    "SSPLLoss",
+    "SaLaDLoss",
+    "SynthesisLoss",
+]

@@ -1,0 +1,423 @@
+"""What all losses share: networks with delayed copies, latents of a batch, masks, reductions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
+from tensordict.nn import TensorDictModule, TensorDictModuleBase
+from tensordict.utils import unravel_key
+from torch import Tensor, nn
+from torchrl.objectives import LossModule
+
+from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
+from torchrl_sspl.modules import as_tensordict_module
+
+REDUCTIONS = ("none", "mean", "sum")
+_ABSENT: Any = None
+
+
+@dataclass
+class LatentBatch:
+    """A batch as the terms of the losses see it.
+
+    Attributes:
+        latent: ``(*batch, p)`` online latent :math:`E_\\theta(o_t)`.
+        next_latent: ``(*batch, p)`` online :math:`E_\\theta(o_{t+1})`, where a term needs it.
+        target_latent: ``(*batch, p)`` delayed :math:`E_{\\theta^-}(o_t)`, no gradient, where needed.
+        target_next_latent: ``(*batch, p)`` delayed :math:`E_{\\theta^-}(o_{t+1})`, no gradient, where needed.
+        action: ``(*batch, action_dim)`` in physical units, where needed.
+        region: ``(*batch, 1)`` int64 region codes, where needed.
+        user_action: ``(*batch, action_dim)`` action of the user's policy, or ``None`` for zero.
+        valid: ``(*batch, 1)`` bool, rows that count, or ``None`` for all.
+        weights: ``(*batch, 1)`` priority weights, or ``None``.
+    """
+
+    latent: Tensor
+    next_latent: Tensor = _ABSENT
+    target_latent: Tensor = _ABSENT
+    target_next_latent: Tensor = _ABSENT
+    action: Tensor = _ABSENT
+    region: Tensor = _ABSENT
+    user_action: Tensor | None = None
+    valid: Tensor | None = None
+    weights: Tensor | None = None
+
+    @property
+    def shape(self) -> torch.Size:
+        """Batch shape."""
+        return self.latent.shape[:-1]
+
+
+def next_key(key: NestedKey) -> NestedKey:
+    """The key of the same entry one step later.
+
+    Example:
+        >>> next_key("pixels")
+        ('next', 'pixels')
+    """
+    return unravel_key(("next", key))
+
+
+def _batch_last(tensor: Tensor, batch: torch.Size) -> Tensor:
+    """``(*batch,)`` or ``(*batch, 1)`` -> ``(*batch, 1)``."""
+    return tensor.unsqueeze(-1) if tensor.shape == batch else tensor
+
+
+def _clean(value: Tensor, valid: Tensor | None) -> Tensor:
+    """Zero in the rows that do not count: a masked NaN behind a network still poisons its gradients."""
+    if valid is None or not value.is_floating_point():
+        return value
+    shape = valid.shape[:-1] + (1,) * (value.ndim - valid.ndim + 1)
+    return torch.where(valid.reshape(shape), value, 0.0)
+
+
+class LatentLoss(LossModule):
+    r"""Base of the losses on latents; not used on its own.
+
+    It keeps every network functional (parameters in ``<network>_params``, delayed copies :math:`\theta^-` in
+    ``target_<network>_params`` where a term needs them), encodes batches, and reduces terms.
+
+    Observations reach the networks in one of three forms:
+
+    * the batch holds ``"frames"`` ``(*batch, 3, 3, H, W)``, frames t-1, t and t+1, and the encoder has
+      a method ``sequence``: each frame is encoded once;
+    * else ``"pixels"`` and ``("next", "pixels")`` are encoded;
+    * without an encoder ``"latent"`` and ``("next", "latent")`` are read.
+
+    Reductions treat a batch statistic as if every row had it, so that ``"sum"`` is always the number
+    of counted rows times ``"mean"``. Rows that ``loss_mask_key`` marks invalid may hold NaN.
+
+    Args:
+        encoder: observation -> latent, or ``None`` if the batches hold latents.
+        dynamics: (latent, action) -> next latent.
+        barrier: latent -> barrier value.
+        policy: latent -> action.
+        delayed: names of the networks of which a delayed copy is kept for a target-network updater.
+        safety_margin: :math:`\psi \ge 0`, in units of the barrier.
+        dynamics_margin: :math:`\eta \ge 0`, in units of the barrier.
+        worst_coeff: weight of the mean over the worst rows, added to the mean over all (0 is off).
+        worst_fraction: share of rows that count as the worst.
+        reduction: ``"none"``, ``"mean"`` or ``"sum"``; ``None`` is ``"mean"``.
+
+    Raises:
+        ConfigError: if an option is not valid.
+    """
+
+    @dataclass
+    class _AcceptedKeys:
+        """Keys that can be changed with ``set_keys``.
+
+        Attributes:
+            observation: observation that the encoder reads.
+            frames: three successive frames, read in place of two observations where present.
+            latent: latent, read where there is no encoder.
+            action: action in physical units.
+            region: region code, 0 unlabelled, 1 safe, 2 unsafe.
+            user_action: action of the user's policy, in physical units.
+            priority_weight: weights of prioritised sampling.
+        """
+
+        observation: NestedKey = "pixels"
+        frames: NestedKey = "frames"
+        latent: NestedKey = "latent"
+        action: NestedKey = "action"
+        region: NestedKey = "region"
+        user_action: NestedKey = "user_action"
+        priority_weight: NestedKey = "priority_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    _schedulable_buffers = frozenset({"safety_margin", "dynamics_margin"})
+
+    encoder: TensorDictModuleBase | None
+    encoder_params: TensorDictParams
+    target_encoder_params: TensorDictParams
+    dynamics: TensorDictModuleBase
+    dynamics_params: TensorDictParams
+    target_dynamics_params: TensorDictParams
+    barrier: TensorDictModuleBase
+    barrier_params: TensorDictParams
+    target_barrier_params: TensorDictParams
+    actor_network: TensorDictModuleBase
+    actor_network_params: TensorDictParams
+    target_actor_network_params: TensorDictParams
+    safety_margin: Tensor
+    dynamics_margin: Tensor
+
+    def __init__(
+        self,
+        *,
+        encoder: nn.Module | None = None,
+        dynamics: nn.Module | None = None,
+        barrier: nn.Module | None = None,
+        policy: nn.Module | None = None,
+        delayed: Iterable[str] = (),
+        safety_margin: float = 0.05,
+        dynamics_margin: float = 0.0,
+        worst_coeff: float = 0.0,
+        worst_fraction: float = 0.05,
+        reduction: str | None = None,
+        **unknown: object,
+    ) -> None:
+        if unknown:
+            raise ConfigError(
+                f"expected options of {type(self).__name__} among {self.options()}, "
+                f"received {sorted(unknown)}"
+            )
+        super().__init__()
+        self._in_keys: list[NestedKey] | None = None
+        self._networks_used: list[str] = []
+        self._needs: set[str] = set()
+        self._active: set[str] = set()
+        self.out_keys: list[str] = []
+        self.reduction = "mean" if reduction is None else reduction
+        if self.reduction not in REDUCTIONS:
+            raise ConfigError(f"expected reduction to be one of {REDUCTIONS}, received {reduction!r}")
+        if not 0.0 < worst_fraction <= 1.0:
+            raise ConfigError(
+                f"expected worst_fraction in (0, 1], received {worst_fraction}; for instance 0.05"
+            )
+        self._coefficients(
+            safety_margin=safety_margin, dynamics_margin=dynamics_margin, worst_coeff=worst_coeff
+        )
+        self.worst_fraction = float(worst_fraction)
+        keys = self.tensor_keys
+        if encoder is not None:
+            self._add("encoder", encoder, [keys.observation], [keys.latent], delayed)
+            self.set_keys(observation=self.encoder.in_keys[0])  # type: ignore[union-attr]
+        else:
+            self.encoder = None
+        if dynamics is not None:
+            self._add("dynamics", dynamics, [keys.latent, keys.action], [next_key(keys.latent)], delayed)
+        if barrier is not None:
+            self._add("barrier", barrier, [keys.latent], ["barrier"], delayed)
+        if policy is not None:
+            # TorchRL's trainers and weight synchronisation look for this name.
+            self._add("actor_network", policy, [keys.latent], [keys.action], delayed)
+
+    # ------------------------------------------------------------------ construction
+
+    @classmethod
+    def options(cls) -> list[str]:
+        """Names of all keyword options of the loss, those of its bases included.
+
+        Example:
+            >>> "safety_margin" in LatentLoss.options()
+            True
+        """
+        names: set[str] = set()
+        for base in cls.__mro__:
+            if issubclass(base, LatentLoss) and "__init__" in base.__dict__:
+                names |= set(base.__init__.__kwdefaults__ or {})
+        return sorted(names - {"delayed"})
+
+    def _coefficients(self, **values: float) -> None:
+        for name, value in values.items():
+            if (
+                isinstance(value, bool)
+                or not isinstance(value, (int, float))
+                or not 0.0 <= value < float("inf")
+            ):
+                raise ConfigError(f"expected {name} to be a finite number >= 0, received {value!r}")
+            self.register_coeff_buffer(name, float(value))
+            if value > 0.0:
+                self._active.add(name)
+
+    def _add(
+        self,
+        name: str,
+        module: nn.Module,
+        in_keys: list[NestedKey],
+        out_keys: list[NestedKey],
+        delayed: Iterable[str] = (),
+    ) -> None:
+        network = as_tensordict_module(module, in_keys, out_keys)
+        self.convert_to_functional(network, name, create_target_params=name in set(delayed))
+        self._networks_used.append(name)
+
+    def _forward_value_estimator_keys(self, **kwargs: object) -> None:
+        self._in_keys = None
+
+    # ------------------------------------------------------------------ keys
+
+    def _set_in_keys(self) -> None:
+        keys = self.tensor_keys
+        source = keys.latent if self.encoder is None else keys.observation
+        self._in_keys = [source]
+        if "action" in self._needs:
+            self._in_keys.append(keys.action)
+        if "region" in self._needs:
+            self._in_keys.append(keys.region)
+        if {"next_latent", "target_next_latent"} & self._needs:
+            self._in_keys.append(next_key(source))
+        if self.encoder is not None:
+            self._in_keys.append(keys.frames)
+        if "user_action" in self._needs:
+            self._in_keys.append(keys.user_action)
+        if self.use_prioritized_weights:
+            self._in_keys.append(keys.priority_weight)
+
+    @property
+    def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
+        """Keys that the loss reads; frames and weights are optional."""
+        if self._in_keys is None:
+            self._set_in_keys()
+        assert self._in_keys is not None
+        return self._in_keys
+
+    @in_keys.setter
+    def in_keys(self, keys: list[NestedKey]) -> None:
+        self._in_keys = keys
+
+    # ------------------------------------------------------------------ networks
+
+    def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
+        """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
+        network = getattr(self, name)
+        if params == "target":
+            values = getattr(self, f"target_{name}_params")
+        else:
+            values = getattr(self, f"{name}_params")
+            values = values.data if params == "frozen" else values
+        # preserve_module_state=False keeps delayed copies from becoming trainable; the context manager
+        # of to_module would leave the copies in the module, which is also the rollout policy, if the
+        # body raised.
+        swapped = values.to_module(network, preserve_module_state=False)
+        try:
+            if method is not None:
+                return getattr(network.module, method)(*inputs)
+            if type(network) is TensorDictModule:
+                return network.module(*inputs)
+            output = network(*inputs)
+            if isinstance(output, tuple):
+                key = self.tensor_keys.action
+                output = output[network.out_keys.index(key) if key in network.out_keys else 0]
+            return output
+        finally:
+            swapped.to_module(network, preserve_module_state=False, return_swap=False)
+
+    # ------------------------------------------------------------------ input
+
+    def _get(self, tensordict: TensorDictBase, key: NestedKey, field: str) -> Tensor:
+        value = tensordict.get(key, None)
+        if value is None:
+            raise ConfigError(
+                f"expected the batch of {type(self).__name__} to hold {key!r}, received the entries "
+                f"{sorted(map(str, tensordict.keys(True, True)))}; collect it, or name yours with "
+                f"set_keys({field}=...)"
+            )
+        return value
+
+    def _valid(self, tensordict: TensorDictBase) -> Tensor | None:
+        valid = None
+        for key in self._loss_mask_keys():
+            mask = tensordict.get(key, None)
+            if mask is not None:
+                mask = _batch_last(mask, tensordict.batch_size).bool()
+                valid = mask if valid is None else valid & mask
+        return valid
+
+    def _encode(
+        self, tensordict: TensorDictBase, valid: Tensor | None, now: bool, after: bool, params: str
+    ) -> list[Tensor]:
+        """Latents of the observation (``now``) and of the next one (``after``), those that are asked for."""
+        keys = self.tensor_keys
+        key, field = (keys.latent, "latent") if self.encoder is None else (keys.observation, "observation")
+        if self.encoder is not None and hasattr(getattr(self.encoder, "module", None), "sequence"):
+            frames = tensordict.get(keys.frames, None)
+            if frames is not None:
+                used = frames.narrow(-4, 0 if now else 1, 3 if now and after else 2)
+                return list(self._run("encoder", used, params=params, method="sequence").unbind(-2))
+        wanted = [key] * now + [next_key(key)] * after
+        observed = [_clean(self._get(tensordict, key, field), valid) for key in wanted]
+        if self.encoder is None:
+            return observed if params == "online" else [latent.detach() for latent in observed]
+        if len(observed) == 1:
+            return [self._run("encoder", observed[0], params=params)]
+        return list(self._run("encoder", torch.stack(observed), params=params).unbind(0))
+
+    def _read(self, tensordict: TensorDictBase) -> LatentBatch:
+        """Latents, action, labels and masks of a batch, as far as the active terms need them."""
+        keys, needs = self.tensor_keys, self._needs
+        valid = self._valid(tensordict)
+        latents = self._encode(tensordict, valid, True, "next_latent" in needs, "online")
+        batch = LatentBatch(latents[0], valid=valid)
+        if "next_latent" in needs:
+            batch.next_latent = latents[1]
+        now, after = "target_latent" in needs, "target_next_latent" in needs
+        if now or after:
+            with torch.no_grad():
+                latents = self._encode(tensordict, valid, now, after, "target")
+            batch.target_latent = latents[0] if now else batch.target_latent
+            batch.target_next_latent = latents[-1] if after else batch.target_next_latent
+        if "action" in self._needs:
+            batch.action = _clean(self._get(tensordict, keys.action, "action"), valid)
+            if batch.action.shape[:-1] != batch.shape:
+                raise ShapeError(
+                    f"expected {keys.action!r} of shape (*{tuple(batch.shape)}, action_dim), received "
+                    f"{tuple(batch.action.shape)}; a scalar action keeps its last dimension of size 1"
+                )
+        if "region" in self._needs:
+            batch.region = self._get(tensordict, keys.region, "region")
+            if batch.region.dtype != torch.int64:
+                raise DTypeError(
+                    f"expected {keys.region!r} of dtype torch.int64 (0 unlabelled, 1 safe, 2 unsafe), "
+                    f"received {batch.region.dtype}; use sets.label"
+                )
+            if batch.region.shape != (*batch.shape, 1):
+                raise ShapeError(
+                    f"expected {keys.region!r} of shape {(*batch.shape, 1)}, received "
+                    f"{tuple(batch.region.shape)}; use sets.label"
+                )
+        weights = self._maybe_get_priority_weight(tensordict)
+        if weights is not None:
+            batch.weights = _batch_last(weights, batch.shape)
+        return batch
+
+    # ------------------------------------------------------------------ output
+
+    def _reduce(
+        self, value: Tensor, batch: LatentBatch, mask: Tensor | None = None, *, worst: bool = False
+    ) -> Tensor:
+        """Reduces ``(*batch, 1)``; ``mask`` picks rows, ``worst`` adds the mean over the worst of them."""
+        if batch.valid is not None:
+            mask = batch.valid if mask is None else mask & batch.valid
+        if mask is not None:
+            value = torch.where(mask, value, 0.0)
+        if worst and "worst_coeff" in self._active:
+            # As a weight per row, so that every reduction and every mask sees the same term.
+            flat = value.detach().flatten()
+            rows = torch.ones_like(flat).sum() if mask is None else mask.sum()
+            worst_rows = (self.worst_fraction * rows).ceil().clamp_min(1.0)
+            order = torch.arange(flat.numel(), device=flat.device)
+            rank = torch.empty_like(order).scatter(0, flat.argsort(descending=True), order)
+            among = (rank < worst_rows).reshape(value.shape)
+            value = value * torch.where(among, 1.0 + self.worst_coeff * rows / worst_rows, 1.0)
+        weights = batch.weights
+        if weights is not None:
+            value = value * weights
+        if self.reduction == "none":
+            return value.squeeze(-1)
+        if self.reduction == "sum":
+            return value.sum()
+        if weights is not None:
+            total = (weights if mask is None else torch.where(mask, weights, 0.0)).sum()
+            return value.sum() / total.clamp_min(torch.finfo(value.dtype).tiny)
+        return value.mean() if mask is None else value.sum() / mask.sum().clamp_min(1)
+
+    def _spread(self, statistic: Tensor, batch: LatentBatch) -> Tensor:
+        """Reduces a statistic of the batch as if every row had it."""
+        return self._reduce(statistic.expand(*batch.shape, 1), batch)
+
+    def _pack(self, terms: dict[str, Tensor], tensordict: TensorDictBase) -> TensorDict:
+        output = TensorDict(terms, batch_size=[])
+        self._clear_weakrefs(
+            tensordict,
+            output,
+            *(f"{prefix}{name}_params" for name in self._networks_used for prefix in ("", "target_")),
+        )
+        return output

@@ -1,0 +1,106 @@
+"""The loss that keeps the policy near a user's policy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase, dispatch
+from torch import Tensor, nn
+
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.functional import policy_deviation
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, _clean
+
+
+class PolicyDeviationLoss(LatentLoss):
+    r"""Keeps the policy near a user's policy, which may be unsafe.
+
+    .. math:: L_\pi = \operatorname{mean}_{D} \| \pi(z) - \pi_{user}(o) \|_2
+
+    Args:
+        encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"``.
+        policy: latent -> action ``(*batch, action_dim)`` in physical units.
+        user_policy: ``None`` for the zero action (the paper's pendulum), ``"data"`` to read
+            ``"user_action"`` from the batch, or a module that is run without gradient: a TensorDict
+            module on the batch, a plain network on the observation (on the latent without encoder). It
+            stays outside the parameters of the loss.
+        detach: ``("encoder",)`` keeps the gradient of this loss out of the encoder.
+        **shared: ``reduction``; see :class:`LatentLoss`.
+
+    Returns:
+        ``forward`` returns a tensordict with ``loss_policy_deviation``.
+
+    Raises:
+        ConfigError: if ``user_policy`` is none of the above, or an entry of the batch is missing.
+
+    Source: paper eq. (13).
+
+    Example:
+        >>> from torchrl_sspl.modules import Policy
+        >>> loss = PolicyDeviationLoss(None, Policy(2, 1), user_policy="data")
+        >>> data = TensorDict(latent=torch.zeros(4, 2), user_action=torch.zeros(4, 1), batch_size=4)
+        >>> loss(data)["loss_policy_deviation"].shape
+        torch.Size([])
+    """
+
+    def __init__(
+        self,
+        encoder: nn.Module | None,
+        policy: nn.Module,
+        *,
+        user_policy: nn.Module | str | None = None,
+        detach: tuple[str, ...] = ("encoder",),
+        **shared: Any,
+    ) -> None:
+        if user_policy is not None and user_policy != "data" and not isinstance(user_policy, nn.Module):
+            raise ConfigError(
+                f"expected user_policy to be None (zero action), 'data' or a module, received {user_policy!r}"
+            )
+        super().__init__(encoder=encoder, policy=policy, **shared)
+        self.detach = tuple(detach)
+        # Outside the module registry: it is not trained, and a target updater must not see it.
+        self.__dict__["user_policy"] = user_policy
+        if user_policy == "data":
+            self._needs.add("user_action")
+        self.out_keys.append("loss_policy_deviation")
+
+    def _read(self, tensordict: TensorDictBase) -> LatentBatch:
+        batch = super()._read(tensordict)
+        keys, user = self.tensor_keys, self.__dict__["user_policy"]
+        if user is None:
+            return batch
+        if user == "data":
+            action = self._get(tensordict, keys.user_action, "user_action")
+        else:
+            with torch.no_grad():
+                if isinstance(user, TensorDictModuleBase):
+                    action = user(tensordict.select(*user.in_keys)).get(keys.action)
+                else:
+                    action = user(self._get(tensordict, self.in_keys[0], "observation"))
+        batch.user_action = _clean(action.detach(), batch.valid)
+        return batch
+
+    def _deviation_terms(self, batch: LatentBatch) -> dict[str, Tensor]:
+        latent = batch.latent.detach() if "encoder" in self.detach else batch.latent
+        action = self._run("actor_network", latent)
+        user = torch.zeros_like(action) if batch.user_action is None else batch.user_action
+        return {"loss_policy_deviation": self._reduce(policy_deviation(action, user), batch)}
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss on a batch of observations or latents.
+
+        Args:
+            tensordict: batch with observation (or frames, or latents); not changed.
+
+        Returns:
+            ``loss_policy_deviation``.
+
+        Raises:
+            ConfigError: if an entry is missing.
+
+        Source: paper eq. (13).
+        """
+        return self._pack(self._deviation_terms(self._read(tensordict)), tensordict)

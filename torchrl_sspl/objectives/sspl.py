@@ -1,0 +1,164 @@
+"""The total loss: world model, synthesis and deviation over the same networks."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+from typing import Any
+
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.objectives.deviation import PolicyDeviationLoss
+from torchrl_sspl.objectives.salad import SaLaDLoss
+from torchrl_sspl.objectives.synthesis import SynthesisLoss
+
+#: Options that a preset sets; whatever is given explicitly wins.
+PRESETS: MappingProxyType[str, MappingProxyType[str, Any]] = MappingProxyType(
+    {
+        "paper": MappingProxyType(
+            {
+                "consistency": "target",
+                "mode": "paper",
+                "successor": "target",
+                "detach": (),
+                "policy_coeff": 1.0,
+                "reduction": "sum",
+            }
+        ),
+        "sound": MappingProxyType(
+            {
+                "safety_margin": 0.5,
+                "consistency": "online",
+                "consistency_coeff": 2.0,
+                "inverse_dynamics_coeff": 1.0,
+                "saturation_coeff": 0.3,
+                "mode": "R3",
+                "successor": "online",
+                "detach": ("encoder", "dynamics"),
+                "growth_coeff": 0.1,
+                "off_manifold_coeff": 0.1,
+                "descent_coeff": 0.1,
+                "synthesis_coeff": 1.0,
+                "worst_coeff": 0.3,
+                "policy_coeff": 0.0,
+                "reduction": "mean",
+            }
+        ),
+    }
+)
+
+
+class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
+    r"""The total loss of semi-supervised safe policy synthesis.
+
+    .. math:: L_{total} = \lambda_1 L_{syn} + \lambda_2 L_{SaLaD} + \lambda_3 L_\pi
+
+    It is a :class:`SaLaDLoss`, a :class:`SynthesisLoss` and a :class:`PolicyDeviationLoss` over the
+    same networks, and takes the options of all three. The Lipschitz term :math:`L_M` is not part of
+    it: it has its own step (:class:`LipschitzLoss`), and the default barrier needs none.
+
+    ``preset`` sets options that were not given:
+
+    * ``"paper"``: the equations as printed, every extra term off, sums over the batch. Needs a target-network
+      updater.
+    * ``"sound"``: consistency through both branches kept from collapse by inverse dynamics and a wide hinge,
+      invariance as R3 with gradient to barrier and policy only, slow growth, hard mining.
+
+    Args:
+        encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"`` and
+            ``("next", "latent")``. ``SSPLLoss(*salad, policy)`` unpacks a
+            :class:`~torchrl_sspl.modules.SaLaD`.
+        dynamics: (latent, action) -> next latent ``(*batch, p)``.
+        barrier: latent -> barrier value ``(*batch, 1)``, at most zero means safe.
+        policy: latent -> action ``(*batch, action_dim)`` in physical units.
+        preset: ``"sound"`` or ``"paper"``.
+        synthesis_coeff: :math:`\lambda_1`.
+        salad_coeff: :math:`\lambda_2`.
+        policy_coeff: :math:`\lambda_3`; 0 leaves the term out.
+        **options: options of the three losses.
+
+    Returns:
+        ``forward`` returns a tensordict with the terms and metrics of the three losses, the terms weighted by
+        :math:`\lambda` too. The set of keys depends on the options only.
+
+    Raises:
+        ConfigError: if an option is unknown or not valid, or an entry of the batch is missing.
+        ShapeError: if action or region have the wrong shape.
+        DTypeError: if the region codes are not int64.
+
+    Source: paper, Algorithm 1, with eq. (8), (10) and (13).
+
+    Example:
+        >>> import torch
+        >>> from torchrl_sspl.modules import LatentDynamics, Policy
+        >>> _ = torch.manual_seed(0)
+        >>> loss = SSPLLoss(None, LatentDynamics(2, 1), nn.Linear(2, 1), Policy(2, 1), preset="sound")
+        >>> data = TensorDict(latent=torch.rand(8, 2), action=torch.randn(8, 1),
+        ...                   region=torch.tensor([0, 0, 0, 0, 1, 1, 2, 2])[:, None],
+        ...                   next=TensorDict(latent=torch.rand(8, 2), batch_size=8), batch_size=8)
+        >>> sum(value for key, value in loss(data).items() if key.startswith("loss_")).backward()
+    """
+
+    synthesis_coeff: Tensor
+    salad_coeff: Tensor
+    policy_coeff: Tensor
+    _schedulable_buffers = frozenset({"synthesis_coeff", "salad_coeff", "policy_coeff"})
+
+    def __init__(
+        self,
+        encoder: nn.Module | None,
+        dynamics: nn.Module,
+        barrier: nn.Module,
+        policy: nn.Module,
+        *,
+        preset: str = "sound",
+        synthesis_coeff: float | None = None,
+        salad_coeff: float | None = None,
+        policy_coeff: float | None = None,
+        **options: Any,
+    ) -> None:
+        if preset not in PRESETS:
+            raise ConfigError(f"expected preset to be one of {tuple(PRESETS)}, received {preset!r}")
+        given = {"synthesis_coeff": synthesis_coeff, "salad_coeff": salad_coeff, "policy_coeff": policy_coeff}
+        given = {name: value for name, value in given.items() if value is not None}
+        chosen = {**PRESETS[preset], **given, **options}
+        weights = {name: chosen.pop(f"{name}_coeff", 1.0) for name in ("synthesis", "salad", "policy")}
+        super().__init__(encoder, dynamics, barrier, policy=policy, **chosen)
+        self.preset = preset
+        self._coefficients(**{f"{name}_coeff": value for name, value in weights.items()})
+        if "policy_coeff" not in self._active:
+            self.out_keys.remove("loss_policy_deviation")
+            self._needs.discard("user_action")
+            self.__dict__["user_policy"] = None
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """All terms on a batch of transitions.
+
+        Args:
+            tensordict: batch with observation (or frames, or latents), action and region; not changed.
+
+        Returns:
+            Weighted ``loss_*`` and detached metrics; see the class.
+
+        Raises:
+            ConfigError: if an entry is missing.
+            ShapeError: if action or region have the wrong shape.
+            DTypeError: if the region codes are not int64.
+
+        Source: paper, Algorithm 1.
+        """
+        batch = self._read(tensordict)
+        parts = [
+            (self.salad_coeff, self._salad_terms(batch)),
+            (self.synthesis_coeff, self._synthesis_terms(batch)),
+        ]
+        if "policy_coeff" in self._active:
+            parts.append((self.policy_coeff, self._deviation_terms(batch)))
+        terms = {}
+        for weight, part in parts:
+            for key, value in part.items():
+                terms[key] = weight * value if key.startswith("loss_") else value
+        return self._pack(terms, tensordict)
