@@ -1,0 +1,29 @@
+# Each target sets up everything it needs in .venv and then runs.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
+
+.PHONY: pendulum test lint docs clean
+
+pendulum: $(VENV)/.viz
+	$(BIN)/python examples/inverted_pendulum.py $(ARGS)
+
+test: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -m "not slow and not gpu and not ray"
+
+docs: $(VENV)/.docs
+	$(BIN)/mkdocs build --strict
+
+$(VENV)/bin/python:
+	$(PYTHON) -m venv $(VENV)
+
+# One stamp per extra: nothing is installed twice, everything again when the requirements change.
+$(VENV)/.%: $(VENV)/bin/python pyproject.toml constraints.txt
+	$(INSTALL) -e '.[$*]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

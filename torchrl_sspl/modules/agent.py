@@ -1,0 +1,253 @@
+"""The frozen result of a training: encoder, barrier, policy and latent dynamics in one object."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
+
+WEIGHTS_FILE = "agent.safetensors"
+DESCRIPTION_FILE = "agent.json"
+FORMAT_VERSION = 1
+
+
+def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
+    """Plain ReLU network ``(*batch, latent_dim) -> (*batch, 1)``: the form in which a barrier is deployed.
+
+    Args:
+        latent_dim: size of the latent.
+        hidden: widths of the hidden layers.
+
+    Returns:
+        Linear and ReLU layers in turn.
+
+    Source: none.
+
+    Example:
+        >>> mlp_barrier(3, [8])(torch.zeros(5, 3)).shape
+        torch.Size([5, 1])
+    """
+    sizes = [latent_dim, *hidden]
+    layers: list[nn.Module] = []
+    for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
+        layers += [nn.Linear(n_in, n_out), nn.ReLU()]
+    return nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
+
+
+#: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
+ENCODERS: dict[str, type[nn.Module]] = {"FrameEncoder": FrameEncoder}
+DYNAMICS: dict[str, type[nn.Module]] = {"LatentDynamics": LatentDynamics}
+POLICIES: dict[str, type[nn.Module]] = {"Policy": Policy}
+
+
+class Agent(nn.Module):
+    r"""A frozen safe agent: :math:`z = E(o)`, :math:`B(z)`, :math:`u = \pi(z)`, :math:`z^+ = d(z, u)`.
+
+    The networks are in evaluation mode and take no gradient. ``barrier``, ``policy`` and ``dynamics`` are
+    modules and are called as such.
+
+    Args:
+        encoder: pixels ``(*batch, 6, H, W)`` uint8 -> latent ``(*batch, p)`` in [-1, 1].
+        dynamics: latent ``(*batch, p)``, action ``(*batch, m)`` in physical units -> next latent ``(*batch, p)``.
+        barrier: latent ``(*batch, p)`` -> ``(*batch, 1)``; at most zero means safe.
+        policy: latent ``(*batch, p)`` -> action ``(*batch, m)`` in physical units (N m, rad/s).
+        lipschitz_bound: the proved Lipschitz constant of ``barrier`` with respect to the Euclidean norm.
+        description: how to build the networks again, and whatever else should travel with the agent.
+
+    Source: paper Section IV (the trained networks); deviation: none.
+
+    Example:
+        >>> from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
+        >>> agent = Agent(FrameEncoder(2, 32), LatentDynamics(2, 1), mlp_barrier(2, [8]), Policy(2, 1), 2.0)
+        >>> latent = agent.encode(torch.zeros(4, 6, 32, 32, dtype=torch.uint8))
+        >>> agent.barrier(latent).shape, agent.dynamics(latent, agent.policy(latent)).shape
+        (torch.Size([4, 1]), torch.Size([4, 2]))
+    """
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        dynamics: nn.Module,
+        barrier: nn.Module,
+        policy: nn.Module,
+        lipschitz_bound: float,
+        description: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.dynamics = dynamics
+        self.barrier = barrier
+        self.policy = policy
+        self.lipschitz_bound = float(lipschitz_bound)
+        self.description: dict[str, Any] = dict(description or {})
+        self.eval()
+        self.requires_grad_(False)
+
+    @torch.no_grad()
+    def encode(self, pixels: Tensor) -> Tensor:
+        """Latent of a stack of two frames.
+
+        Args:
+            pixels: ``(*batch, 6, H, W)`` uint8, frame t-1 (RGB) then frame t (RGB).
+
+        Returns:
+            ``(*batch, p)`` in [-1, 1].
+        """
+        return self.encoder(pixels)
+
+    @torch.no_grad()
+    def act(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+        """Action and barrier value for a stack of two frames.
+
+        Args:
+            pixels: ``(*batch, 6, H, W)`` uint8.
+
+        Returns:
+            action ``(*batch, m)`` in physical units, barrier ``(*batch, 1)``.
+        """
+        latent = self.encode(pixels)
+        return self.policy(latent), self.barrier(latent)
+
+    @property
+    def latent_dim(self) -> int:
+        """Size of the latent."""
+        return int(self.barrier[0].in_features)  # type: ignore[index, union-attr]
+
+    def save(self, path: str | Path) -> Path:
+        """Write ``agent.safetensors`` and ``agent.json`` into a directory.
+
+        Args:
+            path: the directory, created if necessary.
+
+        Returns:
+            The directory.
+
+        Raises:
+            ConfigError: if the agent has no description of its networks.
+        """
+        if "networks" not in self.description:
+            raise ConfigError(
+                "expected description['networks'] (class names and arguments of encoder, dynamics, barrier and policy), "
+                "received none; build the agent with a description to save it"
+            )
+        path = Path(path)
+        path.mkdir(parents=True, exist_ok=True)
+        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, path / WEIGHTS_FILE)
+        body = {"format": FORMAT_VERSION, "lipschitz_bound": self.lipschitz_bound, **self.description}
+        (path / DESCRIPTION_FILE).write_text(json.dumps(body, indent=1, sort_keys=True) + "\n")
+        return path
+
+    @classmethod
+    def load(cls, path: str | Path, device: torch.device | str = "cpu") -> Agent:
+        """Read an agent from a directory that :meth:`save` has written.
+
+        Args:
+            path: the directory.
+            device: where the networks go.
+
+        Returns:
+            The agent, frozen, in evaluation mode.
+
+        Raises:
+            CheckpointError: if a file is missing, unreadable, of another format, or does not fit the networks.
+        """
+        path = Path(path)
+        for name in (DESCRIPTION_FILE, WEIGHTS_FILE):
+            if not (path / name).is_file():
+                raise CheckpointError(
+                    f"expected {name} in the agent directory '{path}', found none; give a run directory or the name of "
+                    "a shipped agent"
+                )
+        try:
+            body = json.loads((path / DESCRIPTION_FILE).read_text())
+            if body.pop("format", None) != FORMAT_VERSION:
+                raise CheckpointError(
+                    f"expected agent format {FORMAT_VERSION} in '{path}'; the agent was written by another version of "
+                    "the library, train it again or load it with that version"
+                )
+            bound = float(body.pop("lipschitz_bound"))
+            nets = body["networks"]
+            agent = cls(
+                _build(ENCODERS, nets["encoder"]),
+                _build(DYNAMICS, nets["dynamics"]),
+                mlp_barrier(**nets["barrier"]),
+                _build(POLICIES, nets["policy"]),
+                bound,
+                body,
+            )
+            agent.load_state_dict(load_file(path / WEIGHTS_FILE))
+        except CheckpointError:
+            raise
+        except (ValueError, KeyError, TypeError, RuntimeError, OSError, SafetensorError) as error:
+            raise CheckpointError(
+                f"expected a readable agent in '{path}', received {type(error).__name__}: {str(error)[:200]}; restore the "
+                "files or train again"
+            ) from error
+        for name, value in agent.state_dict().items():
+            if not torch.isfinite(value).all():
+                raise CheckpointError(f"expected finite weights in '{path}', received NaN or infinity in '{name}'; restore the files")
+        return agent.to(device)
+
+
+def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any]) -> nn.Module:
+    name = spec["class"]
+    if name not in registry:
+        raise CheckpointError(
+            f"expected one of the networks {sorted(registry)}, received '{name}'; add it to the registries of "
+            "torchrl_sspl.modules.agent before loading"
+        )
+    return registry[name](**spec["arguments"])
+
+
+def load(name_or_path: str | Path, device: torch.device | str = "cpu") -> Agent:
+    """Load a shipped agent by name, or an agent from a run directory.
+
+    Args:
+        name_or_path: ``"pendulum"``, or a directory with an agent (or with an ``agent/`` folder) in it.
+        device: where the networks go.
+
+    Returns:
+        The agent, frozen, in evaluation mode.
+
+    Raises:
+        CheckpointError: if there is no such agent, or it cannot be read.
+
+    Source: none.
+    """
+    return Agent.load(agent_directory(name_or_path), device)
+
+
+def agent_directory(name_or_path: str | Path) -> Path:
+    """Directory in which an agent's files lie.
+
+    Args:
+        name_or_path: name of a shipped agent or a directory, as for :func:`load`.
+
+    Returns:
+        The directory with ``agent.json``.
+
+    Raises:
+        CheckpointError: if there is none.
+
+    Source: none.
+    """
+    shipped = Path(__file__).resolve().parent.parent / "agents"
+    candidates = [Path(name_or_path), Path(name_or_path) / "agent"]
+    if isinstance(name_or_path, str) and name_or_path.isidentifier():
+        candidates.insert(0, shipped / name_or_path)
+    for directory in candidates:
+        if (directory / DESCRIPTION_FILE).is_file():
+            return directory
+    names = sorted(p.name for p in shipped.iterdir() if (p / DESCRIPTION_FILE).is_file()) if shipped.is_dir() else []
+    raise CheckpointError(
+        f"expected the name of a shipped agent ({', '.join(names) or 'none is shipped'}) or a run directory with "
+        f"{DESCRIPTION_FILE}, received '{name_or_path}'"
+    )

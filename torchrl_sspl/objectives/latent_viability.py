@@ -1,0 +1,233 @@
+r"""Robust invariant sets of a cloud of latents: what the barrier and the policy are taught.
+
+With frozen encoder and dynamics the encoded data is a point cloud :math:`\{z_i\}`. The largest subset
+:math:`K` such that every :math:`z_i \in K` has an action :math:`u` whose predicted successor keeps a
+distance larger than a radius :math:`\rho` from every point outside :math:`K` is a viability kernel of the
+learned model that tolerates latent errors up to :math:`\rho`. A barrier equal to :math:`L_B` times the
+signed distance to :math:`K` then satisfies :math:`B(z) \le 0 \Rightarrow B(d(z, u)) \le -L_B \rho`: the
+signed distance is the deepest :math:`L_B`-Lipschitz function with that zero level. Only the labels "unsafe"
+enter; no state is used.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_sspl.errors import EmptyRegionError, ShapeError
+
+
+def _tree(points: Tensor):
+    # Imported here: scipy is a dependency, but importing the library stays light without it.
+    from scipy.spatial import cKDTree
+
+    return cKDTree(points.detach().cpu().numpy())
+
+
+def nearest_distance(queries: Tensor, points: Tensor) -> Tensor:
+    """Euclidean distance of every query to the nearest of the points.
+
+    Args:
+        queries: ``(n, p)`` latents.
+        points: ``(m, p)`` latents, ``m >= 1``.
+
+    Returns:
+        ``(n,)`` float32.
+
+    Raises:
+        EmptyRegionError: if there are no points.
+
+    Source: none.
+
+    Example:
+        >>> nearest_distance(torch.tensor([[0.0, 3.0]]), torch.tensor([[0.0, 0.0], [0.0, 1.0]]))
+        tensor([2.])
+    """
+    if points.shape[0] == 0:
+        raise EmptyRegionError("expected at least one point to measure distances to, received 0; collect more data")
+    return torch.as_tensor(_tree(points).query(queries.detach().cpu().numpy())[0], dtype=torch.float32)
+
+
+def normal_projectors(points: Tensor, reference: Tensor, *, neighbours: int = 24, threshold: float = 0.05) -> Tensor:
+    r"""Projector onto the directions in which the data manifold has no extent, at every point.
+
+    .. math:: N_i = \sum_{j: \lambda_j < \tau \lambda_{\max}} v_j v_j^\top
+
+    with eigenpairs of the covariance of the nearest neighbours (local principal components).
+
+    Args:
+        points: ``(n, p)`` latents.
+        reference: ``(m, p)`` latents that sample the manifold.
+        neighbours: number of neighbours per point.
+        threshold: eigenvalue ratio below which a direction counts as normal.
+
+    Returns:
+        ``(n, p, p)`` projectors (zero where the data has extent in every direction).
+
+    Source: none.
+
+    Example:
+        >>> line = torch.stack([torch.linspace(-1, 1, 100), torch.zeros(100)], -1)
+        >>> normal_projectors(line[:1], line)
+        tensor([[[0., 0.],
+                 [0., 1.]]])
+    """
+    k = min(neighbours, reference.shape[0])
+    index = torch.as_tensor(_tree(reference).query(points.detach().cpu().numpy(), k=k)[1]).reshape(len(points), k)
+    local = reference[index]
+    local = local - local.mean(1, keepdim=True)
+    values, vectors = torch.linalg.eigh(local.transpose(1, 2) @ local)
+    normal = (values < threshold * values[:, -1:]).to(vectors.dtype)
+    return (vectors * normal[:, None]) @ vectors.transpose(1, 2)
+
+
+@dataclass
+class InvariantSet:
+    """A robust invariant subset of a cloud of latents.
+
+    Attributes:
+        inside: ``(n,)`` bool, which candidates belong to the set.
+        clearance: ``(n, k)`` distance from the successor under each action to the nearest point outside;
+            for points outside, as it was when they were removed.
+        iterations: sweeps until nothing more was removed.
+    """
+
+    inside: Tensor
+    clearance: Tensor
+    iterations: int
+
+
+def robust_invariant_set(
+    successors: Tensor, candidates: Tensor, outside: Tensor, *, radius: float, max_iterations: int = 500
+) -> InvariantSet:
+    r"""Largest subset of the candidates that can be kept, whatever the latent error up to a radius.
+
+    .. math:: K_{j+1} = \{ z_i \in K_j : \max_u \operatorname{dist}(d(z_i, u), \text{outside} \cup K_j^c) > \rho \}
+
+    Args:
+        successors: ``(n, k, p)`` predicted successors of every candidate under every action.
+        candidates: ``(n, p)`` latents that carry no "unsafe" label.
+        outside: ``(m, p)`` latents of the unsafe label.
+        radius: latent error that the set tolerates.
+        max_iterations: bound on the number of sweeps.
+
+    Returns:
+        The set, with the clearance of every action.
+
+    Raises:
+        ShapeError: if the leading sizes differ.
+        EmptyRegionError: if no unsafe latent is given.
+
+    Source: none (the paper leaves the growth of the safe set to its losses).
+
+    Example:
+        >>> z = torch.linspace(-1, 1, 21)[:, None]
+        >>> step = torch.stack([z - 0.2, z + 0.2], 1)
+        >>> found = robust_invariant_set(step, z, torch.tensor([[-1.1], [1.1]]), radius=0.05)
+        >>> int(found.inside.sum())
+        21
+    """
+    n, k, p = successors.shape
+    if candidates.shape != (n, p):
+        raise ShapeError(
+            f"expected candidates of shape ({n}, {p}) for successors {tuple(successors.shape)}, received "
+            f"{tuple(candidates.shape)}; pass one row of successors per candidate"
+        )
+    if outside.shape[0] == 0:
+        raise EmptyRegionError("expected at least one unsafe latent, received 0; label some observations unsafe")
+    queries = successors.detach().cpu().numpy()
+    inside = np.ones(n, dtype=bool)
+    clearance = np.full((n, k), np.inf, dtype=np.float32)
+    removed = outside
+    iteration = 0
+    for iteration in range(1, max_iterations + 1):
+        # Only the distance to what was removed last can lower a clearance: the tree stays small.
+        index = np.nonzero(inside)[0]
+        if not len(index):
+            break
+        distance = _tree(removed).query(queries[index].reshape(-1, p))[0].reshape(len(index), k)
+        clearance[index] = np.minimum(clearance[index], distance)
+        lost = index[clearance[index].max(1) <= radius]
+        if not len(lost):
+            break
+        inside[lost] = False
+        removed = candidates[torch.as_tensor(lost)]
+    return InvariantSet(torch.as_tensor(inside), torch.as_tensor(clearance), iteration)
+
+
+def barrier_targets(
+    queries: Tensor, inside: Tensor, outside: Tensor, *, tube_radius: float, lipschitz_bound: float
+) -> tuple[Tensor, Tensor]:
+    r"""Target of the barrier at any latent: the Lipschitz bound times a signed distance.
+
+    .. math::
+        B^\star(z) = \begin{cases} -L_B \operatorname{dist}(z, \text{outside}) & z \text{ in the tube around the set} \\
+        L_B \operatorname{dist}(z, \text{tube}) & \text{else} \end{cases}
+
+    Args:
+        queries: ``(n, p)`` latents.
+        inside: ``(m, p)`` latents of the invariant set.
+        outside: ``(l, p)`` latents outside it, off-manifold ones included.
+        tube_radius: distance from the inside latents up to which a latent off the manifold belongs to the set.
+        lipschitz_bound: Lipschitz bound of the barrier.
+
+    Returns:
+        ``(n,)`` targets and ``(n,)`` bool, which queries belong to the set.
+
+    Raises:
+        EmptyRegionError: if either side is empty.
+
+    Source: none; at the set's boundary the target meets paper eq. (3)-(4) with the largest margin.
+
+    Example:
+        >>> target, member = barrier_targets(torch.tensor([[0.0], [0.9]]), torch.tensor([[0.0], [0.1]]),
+        ...                                  torch.tensor([[0.5], [0.9]]), tube_radius=0.2, lipschitz_bound=2.0)
+        >>> target, member
+        (tensor([-1.0000,  1.2000]), tensor([ True, False]))
+    """
+    near_inside = nearest_distance(queries, inside)
+    near_outside = nearest_distance(queries, outside)
+    member = (near_inside < tube_radius) & (near_inside < near_outside)
+    off_tube = torch.where(near_inside > tube_radius, (near_inside - tube_radius).clamp_min(0.02), near_inside)
+    return lipschitz_bound * torch.where(member, -near_outside, off_tube), member
+
+
+def reach_times(successors: Tensor, starts: Tensor, goal: Tensor, *, horizon: int = 120, neighbours: int = 3) -> Tensor:
+    r"""Steps to a goal set under every action, by dynamic programming on the cloud of latents.
+
+    .. math:: T(z_i, u) = 1 + \overline{T}(d(z_i, u)), \quad \overline T(z) = \operatorname{mean}_{j \in nn(z)} \min_u T(z_j, u)
+
+    Args:
+        successors: ``(n, k, p)`` predicted successors of the starts.
+        starts: ``(n, p)`` latents outside the goal.
+        goal: ``(m, p)`` latents of the goal, where the time is zero.
+        horizon: time given to what cannot reach the goal.
+        neighbours: latents over which the time of a successor is averaged.
+
+    Returns:
+        ``(n, k)`` steps, at most ``horizon + 1``.
+
+    Source: none (the paper claims that unsafe starts return, and does not say how).
+
+    Example:
+        >>> z = torch.linspace(0, 0.9, 10)[:, None]
+        >>> steps = reach_times(torch.stack([z, z + 0.1], 1), z, torch.tensor([[1.0]]), neighbours=1)
+        >>> steps[0].tolist()
+        [11.0, 10.0]
+    """
+    n, k, p = successors.shape
+    cloud = torch.cat([starts, goal])
+    found = _tree(cloud).query(successors.detach().cpu().numpy().reshape(-1, p), k=neighbours)[1]
+    index = torch.as_tensor(found).reshape(n, k, -1)
+    times = torch.cat([torch.full((n,), float(horizon)), torch.zeros(len(goal))])
+    per_action = torch.full((n, k), float(horizon))
+    for _ in range(4 * horizon):
+        per_action = 1.0 + times[index].mean(-1)
+        best = per_action.min(1).values.clamp(max=float(horizon))
+        if float((best - times[:n]).abs().max()) < 1e-2:
+            break
+        times[:n] = best
+    return per_action

@@ -1,0 +1,143 @@
+"""The loss that teaches barrier and policy a robust invariant set of the encoded data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.functional import safe_hinge, unsafe_hinge
+from torchrl_sspl.objectives.base import LatentLoss
+from torchrl_sspl.sets import SAFE, UNSAFE
+
+
+class TargetLoss(LatentLoss):
+    r"""Regresses the barrier onto a signed distance and the policy onto the action with the most clearance.
+
+    .. math::
+        L = \operatorname{mean} w(t) r^2 + \kappa \operatorname{mean} \omega \|\pi(z) - u^\star\|^2 / u_{\max}^2
+        + \xi_1 \operatorname{mean}_S \max(0, B + \psi) + \xi_2 \operatorname{mean}_U \max(0, -B + \psi)
+
+    with :math:`r = B(z) - t` inside the set, :math:`r = \max(0, \min(t, t_{\max}) - B(z))` outside (only the sign
+    matters there), and the weight :math:`w(t) = e^{-|t| / s} + 0.1`, largest at the border. Targets come from
+    :mod:`torchrl_sspl.objectives.latent_viability`.
+
+    Args:
+        barrier: latent -> barrier value ``(*batch, 1)``, at most zero means safe.
+        policy: latent -> action ``(*batch, action_dim)`` in physical units.
+        inside_coeff: weight of the residual inside the set.
+        outside_cap: :math:`t_{\max}`, value beyond which a target outside asks for no more.
+        scale: s, in units of the barrier.
+        policy_coeff: :math:`\kappa`.
+        safe_coeff: :math:`\xi_1`, on rows with region code 1.
+        unsafe_coeff: :math:`\xi_2`, on rows with region code 2.
+        action_scale: :math:`u_{\max}`, largest action in physical units.
+        **shared: ``safety_margin`` :math:`\psi`, ``worst_coeff``, ``worst_fraction``, ``reduction``; see
+            :class:`LatentLoss`.
+
+    Returns:
+        ``forward`` returns a tensordict with ``loss_target``, ``loss_policy_target``, ``loss_safe`` and
+        ``loss_unsafe``, weighted.
+
+    Raises:
+        ConfigError: if an option is not valid, or an entry of the batch is missing.
+
+    Source: none; the paper trains barrier and policy on the condition alone, from which no set grows.
+
+    Example:
+        >>> import torch
+        >>> from torchrl_sspl.modules import Policy
+        >>> _ = torch.manual_seed(0)
+        >>> loss = TargetLoss(nn.Linear(2, 1), Policy(2, 1))
+        >>> rows = TensorDict(latent=torch.rand(4, 2), barrier_target=torch.zeros(4, 1), action_target=torch.zeros(4, 1),
+        ...                   inside=torch.ones(4, 1, dtype=torch.bool), action_weight=torch.ones(4, 1),
+        ...                   region=torch.tensor([[0], [0], [1], [2]]), batch_size=4)
+        >>> sorted(loss(rows).keys())
+        ['loss_policy_target', 'loss_safe', 'loss_target', 'loss_unsafe']
+    """
+
+    @dataclass
+    class _AcceptedKeys(LatentLoss._AcceptedKeys):
+        """Keys that can be changed with ``set_keys``.
+
+        Attributes:
+            barrier_target: ``(*batch, 1)`` target of the barrier.
+            inside: ``(*batch, 1)`` bool, whether the latent belongs to the set.
+            action_target: ``(*batch, action_dim)`` target of the policy, physical units.
+            action_weight: ``(*batch, 1)`` weight of the policy's target (0: none).
+        """
+
+        barrier_target: NestedKey = "barrier_target"
+        inside: NestedKey = "inside"
+        action_target: NestedKey = "action_target"
+        action_weight: NestedKey = "action_weight"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+    safe_coeff: Tensor
+    unsafe_coeff: Tensor
+    policy_coeff: Tensor
+    inside_coeff: Tensor
+
+    def __init__(
+        self,
+        barrier: nn.Module,
+        policy: nn.Module,
+        *,
+        inside_coeff: float = 1.0,
+        outside_cap: float = float("inf"),
+        scale: float = 0.2,
+        policy_coeff: float = 1.0,
+        safe_coeff: float = 0.0,
+        unsafe_coeff: float = 0.0,
+        action_scale: float = 1.0,
+        **shared: Any,
+    ) -> None:
+        if not outside_cap > 0 or not scale > 0 or not action_scale > 0:
+            raise ConfigError(
+                f"expected outside_cap, scale and action_scale > 0, received {outside_cap}, {scale}, {action_scale}"
+            )
+        super().__init__(barrier=barrier, policy=policy, **shared)
+        self._coefficients(
+            inside_coeff=inside_coeff, policy_coeff=policy_coeff, safe_coeff=safe_coeff, unsafe_coeff=unsafe_coeff
+        )
+        self.outside_cap, self.scale, self.action_scale = float(outside_cap), float(scale), float(action_scale)
+        self._needs |= {"region"}
+        self.out_keys += ["loss_target", "loss_policy_target", "loss_safe", "loss_unsafe"]
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        keys = self.tensor_keys
+        assert self._in_keys is not None
+        self._in_keys += [keys.barrier_target, keys.inside, keys.action_target, keys.action_weight]
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """Terms of the loss on a batch of latents with their targets; the batch is not changed."""
+        keys = self.tensor_keys
+        batch = self._read(tensordict)
+        target = self._get(tensordict, keys.barrier_target, "barrier_target")
+        inside = self._get(tensordict, keys.inside, "inside")
+        barrier = self._run("barrier", batch.latent)
+        short = (target.clamp_max(self.outside_cap) - barrier).clamp_min(0.0)
+        residual = (barrier - target).square() * self.inside_coeff
+        near = (-target.abs() / self.scale).exp() + 0.1
+        fit = near * residual.where(inside, short.square())
+        action = self._run("actor_network", batch.latent)
+        gap = (action - self._get(tensordict, keys.action_target, "action_target")) / self.action_scale
+        weight = self._get(tensordict, keys.action_weight, "action_weight")
+        follow = weight * gap.square().mean(-1, keepdim=True)
+        safe, unsafe = batch.region == SAFE, batch.region == UNSAFE
+        terms = {
+            "loss_target": self._reduce(fit, batch, worst=True),
+            "loss_policy_target": self.policy_coeff * self._reduce(follow, batch),
+            "loss_safe": self.safe_coeff
+            * self._reduce(safe_hinge(barrier, self.safety_margin), batch, safe, worst=True),
+            "loss_unsafe": self.unsafe_coeff
+            * self._reduce(unsafe_hinge(barrier, self.safety_margin), batch, unsafe, worst=True),
+        }
+        return self._pack(terms, tensordict)
