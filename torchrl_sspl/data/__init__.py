@@ -1,0 +1,8 @@
+"""Labelled transitions, each frame stored once, and their collection through TorchRL."""
+
+from __future__ import annotations
+
+from torchrl_sspl.data.collect import RandomActions, collect_random, collect_rollouts
+from torchrl_sspl.data.store import RegionSampler, TransitionStore
+
+__all__ = ["RandomActions", "RegionSampler", "TransitionStore", "collect_random", "collect_rollouts"]

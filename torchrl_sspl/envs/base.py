@@ -124,7 +124,7 @@ class SafetyEnv(EnvBase):
         self._frame = torch.zeros(n, 3, image_size, image_size, dtype=torch.uint8, device=self.device)
         self._steps = torch.zeros(n, dtype=torch.int64, device=self.device)
 
-    # -- what a system defines -------------------------------------------------------------------------------
+    # -- what a system defines -------------------------------------------------------------------------
 
     @abstractmethod
     def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
@@ -142,7 +142,7 @@ class SafetyEnv(EnvBase):
     def draw(self, state: Tensor) -> Tensor:
         """One RGB frame per state, uint8 ``(n, 3, H, W)``."""
 
-    # -- what follows from it --------------------------------------------------------------------------------
+    # -- what follows from it --------------------------------------------------------------------------
 
     def observe(self, state: Tensor, previous_state: Tensor | None = None) -> Tensor:
         """Two stacked frames of given states.
@@ -205,7 +205,7 @@ class SafetyEnv(EnvBase):
         check_tensor("action", action, self.action_dim)
         return action.clamp(-self.max_action, self.max_action)
 
-    # -- TorchRL ---------------------------------------------------------------------------------------------
+    # -- TorchRL ---------------------------------------------------------------------------------------
 
     def _make_specs(self) -> None:
         shape, device = self.batch_size, self.device

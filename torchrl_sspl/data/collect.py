@@ -1,0 +1,195 @@
+"""Data from an environment: random actions for the warm start, rollouts of a policy, both through TorchRL."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torchrl.collectors import Collector
+from torchrl.envs import EnvBase
+
+from torchrl_sspl.data.store import TransitionStore
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.sets import Region
+
+_BATCH = 2048  # transitions at a time; an episode that a batch cuts in two costs two frames more
+
+
+class RandomActions(TensorDictModuleBase):
+    """Policy that draws actions uniformly from the action bounds, with a random generator of its own.
+
+    Args:
+        env (EnvBase): gives the bounded action spec.
+        seed (int, optional): seed of the generator. Default None: different every time.
+    """
+
+    def __init__(self, env: EnvBase, seed: int | None = None) -> None:
+        super().__init__()
+        self.in_keys: list[str] = []
+        self.out_keys = ["action"]
+        spec = env.action_spec_unbatched
+        self._low, self._high = spec.space.low, spec.space.high
+        self._seed = seed
+        self._generator: torch.Generator | None = None
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"`` ``(*batch, action_dim)``."""
+        if self._generator is None:  # here, so that the policy can be sent to another process
+            self._generator = torch.Generator(device=self._low.device)
+            if self._seed is None:
+                self._generator.seed()
+            else:
+                self._generator.manual_seed(self._seed)
+        shape = (*tensordict.batch_size, *self._low.shape)
+        unit = torch.rand(shape, generator=self._generator, device=self._low.device)
+        return tensordict.set("action", self._low + unit * (self._high - self._low))
+
+
+def collect_random(
+    env: EnvBase | Callable[[], EnvBase],
+    n: int,
+    *,
+    seed: int | None = None,
+    steps: int | None = None,
+    region: Region | None = None,
+    store: TransitionStore | None = None,
+    keep_state: bool = False,
+    **collector: Any,
+) -> TransitionStore:
+    """Collect n transitions under uniformly random actions.
+
+    Args:
+        env: environment, or a function that makes one (required by backends with other processes).
+        n (int): number of transitions.
+        seed (int, optional): seed of states and actions; with the direct backend the result is then the same
+            every time. Default None: not seeded.
+        steps (int, optional): longest episode; 1 gives independent transitions. Default None: until the
+            environment ends it.
+        region (Region, optional): set from which episodes start, such as ``env.safe_set``. Default the
+            environment's ``initial_set``, all of the state space.
+        store (TransitionStore, optional): store to add to. Default a new one of capacity n.
+        keep_state (bool): keep true states in a new store, for evaluation. Default False.
+        **collector: arguments of ``torchrl.collectors.Collector``, such as ``backend``, ``num_collectors``,
+            ``frames_per_batch``. Default ``backend="direct"``.
+
+    Returns:
+        TransitionStore: the store with n more transitions.
+
+    Raises:
+        ConfigError: ``n`` or ``steps`` is not positive, or ``region`` is given with a function.
+
+    Source: paper, Section IV-D (warm start on uniform random actions). Deviation: none.
+
+    Example:
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> store = collect_random(PendulumEnv(batch_size=[8]), 100, seed=0)
+        >>> len(store)
+        100
+    """
+    probe = env if isinstance(env, EnvBase) else env()
+    policy = RandomActions(probe, None if seed is None else seed + 1)
+    return collect_rollouts(
+        env,
+        policy,
+        n,
+        seed=seed,
+        steps=steps,
+        region=region,
+        store=store,
+        keep_state=keep_state,
+        **collector,
+    )
+
+
+def collect_rollouts(
+    env: EnvBase | Callable[[], EnvBase],
+    policy: Callable[[TensorDictBase], TensorDictBase],
+    n: int,
+    *,
+    seed: int | None = None,
+    steps: int | None = None,
+    region: Region | None = None,
+    store: TransitionStore | None = None,
+    keep_state: bool = False,
+    **collector: Any,
+) -> TransitionStore:
+    """Collect n transitions under a policy; the arguments are those of ``collect_random``.
+
+    Args:
+        policy: tensordict module or callable that writes ``"action"``; let it write nothing else
+            (``selected_out_keys=["action"]``), what it writes is carried along.
+
+    Returns:
+        TransitionStore: the store with n more transitions.
+
+    Raises:
+        ConfigError: ``n`` or ``steps`` is not positive, or ``region`` is given with a function.
+
+    Source: Algorithm 1 of the paper (rollouts of the policy join D). Deviation: none.
+
+    Example:
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> still = lambda tensordict: tensordict.set("action", torch.zeros(*tensordict.shape, 1))
+        >>> env = PendulumEnv(batch_size=[8])
+        >>> len(collect_rollouts(env, still, 40, seed=0, steps=10, region=env.safe_set))
+        40
+    """
+    if n < 1 or (steps is not None and steps < 1):
+        raise ConfigError(f"collection: expected n >= 1 and steps >= 1 or None, received {n} and {steps}.")
+    if region is not None and not isinstance(env, EnvBase):
+        raise ConfigError(
+            "region: expected with an environment only, received it with a function that makes one."
+        )
+    if store is None:
+        store = TransitionStore(n, keep_state=keep_state)
+    if isinstance(env, EnvBase) and seed is not None:
+        env.set_seed(seed)  # before the collector resets it
+    width = env.numel() if isinstance(env, EnvBase) else 1
+    options = {"backend": "direct", "frames_per_batch": max(1, min(-(-n // width), _BATCH // width)) * width}
+    options.update(collector)
+    if options["backend"] == "direct":
+        options.setdefault("return_same_td", True)  # what is collected is copied into the store at once
+    with _starting_in(env, region):
+        source = Collector(
+            env,
+            policy,
+            total_frames=-1,
+            max_frames_per_traj=steps,
+            auto_register_policy_transforms=False,
+            trust_policy=True,
+            **options,
+        )
+        try:
+            if seed is not None and not isinstance(env, EnvBase):
+                source.set_seed(seed)
+            missing = n
+            for data in source:
+                # Environments last, so that a last batch that is larger than needed is cut in time.
+                rows = data[..., : -(-missing * data.shape[-1] // data.numel())].reshape(-1)[:missing]
+                store.extend(rows)
+                missing -= rows.shape[0]
+                if missing == 0:
+                    break
+        finally:
+            source.shutdown(close_env=False)
+    return store
+
+
+@contextlib.contextmanager
+def _starting_in(env: Any, region: Region | None) -> Iterator[None]:
+    """Let episodes of the environment start in a region meanwhile."""
+    if region is None:
+        yield
+        return
+    before, env.initial_set = env.initial_set, region
+    try:
+        yield
+    finally:
+        env.initial_set = before
+
+
+__all__ = ["RandomActions", "collect_random", "collect_rollouts"]

@@ -1,0 +1,448 @@
+"""A transition store that keeps every frame once, and a sampler that knows the region labels."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torchrl.data.replay_buffers import RoundRobinWriter, Sampler, Storage, TensorDictReplayBuffer
+
+from torchrl_sspl.data.frames import FrameBank
+from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, EmptyRegionError, ShapeError
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+
+_FILE = "transitions.safetensors"
+_BLOCK = 32768  # frames per block of the bank, at most
+_NAMES = {UNLABELLED: "unlabelled", SAFE: "safe", UNSAFE: "unsafe"}
+
+
+class TransitionStore(Storage):
+    """Labelled transitions (o_t, u_t, o_{t+1}) in which every frame is stored once, as uint8.
+
+    An observation is a pair of frames, so a transition refers to three, (t-1, t, t+1), and the next one of
+    the same episode shares two of them. The store recognises consecutive transitions by comparing their
+    pixels, keeps triples of frame numbers, and hands out the three frames together, so that each can be
+    encoded once.
+
+    It is a TorchRL ``Storage``; ``replay_buffer`` puts it into a ``TensorDictReplayBuffer`` with stratified
+    batches, for TorchRL's trainers and collectors. It also works by itself (``extend``, ``sample``). When
+    it is full, the oldest transitions make room.
+
+    What is read from a tensordict that is written: ``"pixels"`` and ``("next", "pixels")`` uint8 ``(n, 6,
+    H, W)``, ``"action"``, ``"region"``, and where present ``("next", "region")``, ``("next",
+    "terminated")`` and, with ``keep_state``, ``"state"`` and ``("next", "state")``.
+
+    What comes out: ``"frames"`` uint8 ``(n, 3, 3, H, W)`` (time, RGB, height, width), ``"action"``,
+    ``"region"`` int64 ``(n, 1)``, ``("next", "region")``, ``("next", "terminated")``; with ``pixel_views``
+    also ``"pixels"`` and ``("next", "pixels")``, which share the memory of ``"frames"``; with
+    ``keep_state`` also ``("info", "state")`` and ``("info", "next_state")``, which no loss reads.
+
+    Args:
+        capacity (int): largest number of transitions.
+        pixel_views (bool): hand out the observations beside the frames. Default False.
+        keep_state (bool): keep the true states, for evaluation. Default False.
+
+    Raises:
+        ConfigError: ``capacity`` is not a positive integer.
+
+    Source: the data sets D, S, U of the paper (Section IV): S and U are the labelled part of D, not copies.
+
+    Example:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> video = torch.randint(255, (12, 3, 8, 8), dtype=torch.uint8)
+        >>> pixels = torch.cat([video[:-1], video[1:]], dim=1)
+        >>> store = TransitionStore(100)
+        >>> _ = store.extend(TensorDict({
+        ...     "pixels": pixels[:-1], "next": {"pixels": pixels[1:]}, "action": torch.zeros(10, 1),
+        ...     "region": torch.ones(10, 1, dtype=torch.int64)}, [10]))
+        >>> len(store), store.n_frames
+        (10, 12)
+        >>> store.sample(4, generator=torch.Generator().manual_seed(0))["frames"].shape
+        torch.Size([4, 3, 3, 8, 8])
+    """
+
+    def __init__(self, capacity: int, *, pixel_views: bool = False, keep_state: bool = False) -> None:
+        if not isinstance(capacity, int) or capacity < 1:
+            raise ConfigError(f"capacity: expected an integer >= 1, received {capacity!r}.")
+        super().__init__(capacity)
+        self.pixel_views, self.keep_state = pixel_views, keep_state
+        self.device = torch.device("cpu")
+        self._len = self._cursor = 0
+        self._bank = FrameBank(1)
+        self._columns: dict[str, Tensor] = {}
+        self._by_region: dict[int | None, Tensor] = {}
+        self._empty()
+
+    # -- sizes -----------------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return self._len
+
+    @property
+    def n_frames(self) -> int:
+        """Number of different frames held."""
+        return int((self._bank._uses > 0).sum())
+
+    @property
+    def memory_bytes(self) -> int:
+        """Bytes of all tensors that the store has allocated."""
+        columns = sum(c.numel() * c.element_size() for c in self._columns.values())
+        return self._bank.memory_bytes + columns
+
+    def indices(self, region: int | None = None) -> Tensor:
+        """Positions of the transitions that start in a region (a code of ``sets``), or of all.
+
+        Raises:
+            EmptyRegionError: there is none.
+        """
+        if region not in self._by_region:
+            if region is None:
+                found = torch.arange(self._len)
+            else:
+                held = self._columns.get("region", torch.zeros(0, 1, dtype=torch.int64))[: self._len, 0]
+                found = (held == region).nonzero().squeeze(1)
+            self._by_region[region] = found
+        found = self._by_region[region]
+        if not found.numel():
+            what = "transitions" if region is None else f"{_NAMES[region]} transitions"
+            raise EmptyRegionError(
+                f"store: expected {what}, found none among {self._len}; collect some, for example "
+                "with collect_random(env, n, region=...)."
+            )
+        return found
+
+    # -- writing ---------------------------------------------------------------------------------------
+
+    def extend(self, data: TensorDictBase) -> Tensor:
+        """Add transitions ``(*batch,)``, time last; the oldest make room. Returns positions."""
+        data = data.reshape(-1)
+        index = (self._cursor + torch.arange(data.shape[0])) % self.max_size
+        self.set(index, data)
+        return index
+
+    def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
+        """Write transitions at given positions (the interface of ``Storage``)."""
+        index = self._positions(cursor, self.max_size)
+        data = data.reshape(-1)
+        if index.numel() != data.shape[0]:
+            raise ShapeError(f"store: expected {index.numel()} transitions, received {data.shape[0]}.")
+        if index.numel() > self.max_size:  # a ring that is passed more than once keeps the last round
+            index, data = index[-self.max_size :], data[-self.max_size :]
+        if not index.numel():
+            return
+        now, then = self._observations(data)
+        columns = self._rows(data)
+        if set_cursor:
+            self._set_last_cursor(index)
+            self._cursor = int(index[-1] + 1) % self.max_size
+        # Free what is overwritten first, so that its slots can serve again.
+        triples = self._columns.get("triple")
+        if triples is not None:
+            old = triples[index]
+            self._bank.hold(old[old[:, 0] >= 0], -1)
+        columns["triple"] = self._store_frames(now, then)
+        for name, rows in columns.items():
+            if name not in self._columns:
+                missing = -1 if name == "triple" else 0
+                self._columns[name] = torch.full((self.max_size, *rows.shape[1:]), missing, dtype=rows.dtype)
+            self._columns[name][index] = rows
+        self._len = max(self._len, int(index.max()) + 1)
+        self._by_region = {}
+        self._bump_mutation_revision()
+
+    def _observations(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
+        pixels, following = data.get("pixels", None), data.get(("next", "pixels"), None)
+        if pixels is None or following is None:
+            raise ShapeError("store: expected 'pixels' and ('next', 'pixels'), found not both.")
+        for name, value in (("pixels", pixels), ("next pixels", following)):
+            if value.dtype != torch.uint8:
+                raise DTypeError(f"{name}: expected uint8, received {value.dtype}; keep frames unconverted.")
+            if value.ndim != 4 or value.shape[1] != 6:
+                raise ShapeError(f"{name}: expected shape (n, 6, H, W), received {tuple(value.shape)}.")
+        if not torch.equal(pixels[:, 3:], following[:, :3]):
+            raise ConfigError(
+                "store: expected ('next', 'pixels') to begin with the second frame of 'pixels', received "
+                "other frames; stack two consecutive frames."
+            )
+        return pixels.cpu(), following.cpu()
+
+    def _store_frames(self, now: Tensor, then: Tensor) -> Tensor:
+        """Store the frames of transitions, each once; returns the frame numbers ``(n, 3)``."""
+        linked = torch.zeros(now.shape[0], dtype=torch.bool)
+        linked[1:] = (now[1:] == then[:-1]).flatten(1).all(1)
+        # A transition that continues the one before it brings one new frame, any other three: the frames of
+        # every transition are the last three slots taken so far.
+        end = torch.where(linked, 1, 3).cumsum(0)
+        slots = self._bank.reserve(int(end[-1]), now.shape[2:])
+        triple = slots[end[:, None] + torch.tensor([-3, -2, -1])]
+        first = triple[~linked]
+        self._bank.write(first[:, 0], now[~linked, :3])
+        self._bank.write(first[:, 1], now[~linked, 3:])
+        self._bank.write(triple[:, 2], then[:, 3:])
+        self._bank.hold(triple, +1)
+        return triple
+
+    def _rows(self, data: TensorDictBase) -> dict[str, Tensor]:
+        n = data.shape[0]
+        action, region = data.get("action", None), data.get("region", None)
+        if action is None or region is None:
+            raise ShapeError("store: expected 'action' and 'region', found not both.")
+        rows = {"action": action.reshape(n, -1), "region": region.reshape(n, 1)}
+        rows["next_region"] = data.get(("next", "region"), torch.zeros_like(region)).reshape(n, 1)
+        ended = data.get(("next", "terminated"), None)
+        rows["terminated"] = torch.zeros(n, 1, dtype=torch.bool) if ended is None else ended.reshape(n, 1)
+        if self.keep_state:
+            state, following = data.get("state", None), data.get(("next", "state"), None)
+            if state is None or following is None:
+                raise ShapeError("store: keep_state needs 'state' and ('next', 'state'), found not both.")
+            rows["state"], rows["next_state"] = state.reshape(n, -1), following.reshape(n, -1)
+        return {name: value.detach().cpu() for name, value in rows.items()}
+
+    # -- reading ---------------------------------------------------------------------------------------
+
+    def get(self, index: Any) -> TensorDict:
+        """Transitions at given positions: an integer, a slice, or an integer tensor."""
+        single = isinstance(index, int) or (isinstance(index, Tensor) and index.ndim == 0)
+        rows = self._positions(index, self._len)
+        if rows.numel() and (int(rows.max()) >= self._len or int(rows.min()) < 0):
+            raise ConfigError(f"store: expected positions below {self._len}, received {int(rows.max())}.")
+        column = {name: values[rows] for name, values in self._columns.items()}
+        frames = self._bank.read(column["triple"].reshape(-1))
+        frames = frames.reshape(rows.numel(), 3, *frames.shape[1:])
+        out = TensorDict(
+            {
+                "frames": frames,
+                "action": column["action"],
+                "region": column["region"],
+                "next": {"region": column["next_region"], "terminated": column["terminated"]},
+            },
+            batch_size=[rows.numel()],
+        )
+        if self.pixel_views:
+            out["pixels"], out["next", "pixels"] = frames[:, :2].flatten(1, 2), frames[:, 1:].flatten(1, 2)
+        if self.keep_state:
+            out["info"] = TensorDict(
+                {"state": column["state"], "next_state": column["next_state"]}, batch_size=[rows.numel()]
+            )
+        return out[0] if single else out
+
+    def sample(
+        self,
+        n: int,
+        generator: torch.Generator | None = None,
+        *,
+        safe: float = 0.0,
+        unsafe: float = 0.0,
+    ) -> TensorDict:
+        """Draw n transitions with replacement: shares ``safe`` and ``unsafe`` from S and U, the rest from D.
+
+        Raises:
+            EmptyRegionError: a set from which a positive share is wanted is empty.
+        """
+        return self.get(stratified_indices(self, n, safe, unsafe, generator))
+
+    def replay_buffer(
+        self, batch_size: int, *, safe: float = 0.125, unsafe: float = 0.125, **buffer: Any
+    ) -> TensorDictReplayBuffer:
+        """This store as a TorchRL replay buffer with stratified batches; see ``RegionSampler``.
+
+        Args:
+            batch_size (int): transitions per batch.
+            safe, unsafe (float): shares of S and U in a batch. **buffer: arguments of
+                ``TensorDictReplayBuffer``, such as ``prefetch`` or ``generator``.
+        """
+        made = TensorDictReplayBuffer(
+            storage=self,
+            sampler=RegionSampler(safe, unsafe),
+            writer=RoundRobinWriter(),
+            collate_fn=_as_it_is,
+            batch_size=batch_size,
+            **buffer,
+        )
+        made.writer._cursor = self._cursor  # go on behind what the store holds already
+        return made
+
+    @staticmethod
+    def _positions(index: Any, size: int) -> Tensor:
+        if isinstance(index, slice):
+            return torch.arange(*index.indices(size))
+        return torch.as_tensor(index, dtype=torch.int64).reshape(-1).cpu()
+
+    # -- saving ----------------------------------------------------------------------------------------
+
+    def state_dict(self) -> dict[str, Any]:
+        """All transitions and frames as tensors, frames without gaps; see ``load_state_dict``."""
+        state: dict[str, Any] = {name: values[: self._len].clone() for name, values in self._columns.items()}
+        state["_meta"] = {"len": self._len, "cursor": self._cursor, "keep_state": self.keep_state}
+        if self._len:
+            used, number = state["triple"].unique(return_inverse=True)
+            state["frames"], state["triple"] = self._bank.read(used), number
+        return state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore what ``state_dict`` returned, bit for bit; the capacity must suffice."""
+        meta = state_dict["_meta"]
+        if meta["len"] > self.max_size:
+            raise CheckpointError(
+                f"store: expected at most {self.max_size} transitions, found {meta['len']}."
+            )
+        self._empty()
+        self.keep_state = meta["keep_state"]
+        self._len, self._cursor = meta["len"], meta["cursor"] % self.max_size
+        if self._len:
+            slots = self._bank.reserve(state_dict["frames"].shape[0], state_dict["frames"].shape[2:])
+            self._bank.write(slots, state_dict["frames"])
+            for name, values in state_dict.items():
+                if name in ("_meta", "frames"):
+                    continue
+                values = slots[values] if name == "triple" else values
+                missing = -1 if name == "triple" else 0
+                column = torch.full((self.max_size, *values.shape[1:]), missing, dtype=values.dtype)
+                column[: self._len] = values
+                self._columns[name] = column
+            self._bank.hold(self._columns["triple"][: self._len], +1)
+        self._bump_mutation_revision()
+
+    def dumps(self, path: str | os.PathLike[str]) -> None:
+        """Write the store into a folder (one safetensors file)."""
+        from safetensors.torch import save_file
+
+        folder = Path(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        state = self.state_dict()
+        meta = json.dumps({**state.pop("_meta"), "capacity": self.max_size})
+        partial = folder / (_FILE + ".partial")
+        save_file({k: v.contiguous() for k, v in state.items()}, partial, metadata={"store": meta})
+        partial.replace(folder / _FILE)  # a file that is there is complete
+
+    def loads(self, path: str | os.PathLike[str]) -> None:
+        """Read what ``dumps`` wrote.
+
+        Raises:
+            CheckpointError: there is no such file, or it cannot be read, or it does not fit the capacity.
+        """
+        state, meta = _read(Path(path))
+        self.load_state_dict({**state, "_meta": meta})
+
+    @classmethod
+    def from_folder(cls, path: str | os.PathLike[str], *, pixel_views: bool = False) -> TransitionStore:
+        """A store with the content and the capacity of the one that was saved in a folder."""
+        state, meta = _read(Path(path))
+        store = cls(meta["capacity"], pixel_views=pixel_views, keep_state=meta["keep_state"])
+        store.load_state_dict({**state, "_meta": meta})
+        return store
+
+    def _empty(self) -> None:
+        self._len, self._cursor = 0, 0
+        self._columns, self._by_region = {}, {}
+        self._bank = FrameBank(min(_BLOCK, self.max_size + self.max_size // 4 + 64))
+
+    def contains(self, item: Any) -> Tensor:
+        """Whether positions hold a transition."""
+        index = torch.as_tensor(item)
+        return (index >= 0) & (index < self._len)
+
+
+def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    from safetensors import SafetensorError, safe_open
+
+    file = folder / _FILE
+    try:
+        with safe_open(file, framework="pt") as opened:
+            meta = json.loads(opened.metadata()["store"])
+            return {name: opened.get_tensor(name) for name in opened.keys()}, meta  # noqa: SIM118
+    except (OSError, SafetensorError, KeyError, TypeError, ValueError) as error:
+        raise CheckpointError(
+            f"store: expected a transition store in {folder}, cannot read {file.name} ({error}); "
+            "pass the folder that was given to dumps()."
+        ) from error
+
+
+def stratified_indices(
+    store: TransitionStore,
+    n: int,
+    safe: float = 0.0,
+    unsafe: float = 0.0,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """Positions of n transitions: ``round(n safe)`` from S, ``round(n unsafe)`` from U, the rest from D.
+
+    Raises:
+        ConfigError: a share is negative, or they add up to more than 1.
+        EmptyRegionError: a set from which a positive share is wanted is empty.
+    """
+    if safe < 0 or unsafe < 0 or safe + unsafe > 1:
+        raise ConfigError(f"shares: expected safe, unsafe >= 0 with a sum <= 1, received {safe}, {unsafe}.")
+    n_safe, n_unsafe = round(n * safe), round(n * unsafe)
+    parts = []
+    for region, count in ((None, n - n_safe - n_unsafe), (SAFE, n_safe), (UNSAFE, n_unsafe)):
+        if count > 0:
+            members = store.indices(region)
+            parts.append(members[torch.randint(members.numel(), (count,), generator=generator)])
+    return torch.cat(parts) if parts else torch.zeros(0, dtype=torch.int64)
+
+
+def _as_it_is(batch: TensorDict) -> TensorDict:
+    return batch
+
+
+class RegionSampler(Sampler):
+    """Draws fixed shares of each batch from the labelled sets S and U, the rest from all transitions D.
+
+    Args:
+        safe, unsafe (float): shares of S and U. Default one eighth each.
+
+    Raises:
+        ConfigError: a share is negative, they add up to more than 1, or the storage is not a
+            ``TransitionStore``.
+
+    Source: Algorithm 1 of the paper (samples of S, U and D). Deviation: none.
+
+    Example:
+        >>> buffer = TransitionStore(1000).replay_buffer(batch_size=64, safe=0.25, unsafe=0.25)
+        >>> buffer.sampler.safe
+        0.25
+    """
+
+    def __init__(self, safe: float = 0.125, unsafe: float = 0.125) -> None:
+        if safe < 0 or unsafe < 0 or safe + unsafe > 1:
+            raise ConfigError(
+                f"shares: expected safe, unsafe >= 0 with a sum <= 1, received {safe}, {unsafe}."
+            )
+        self.safe, self.unsafe = safe, unsafe
+
+    def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:
+        """Positions ``(batch_size,)`` and an empty info."""
+        if not isinstance(storage, TransitionStore):
+            raise ConfigError(f"storage: expected a TransitionStore, received {type(storage).__name__}.")
+        return stratified_indices(storage, batch_size, self.safe, self.unsafe, self._rng), {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """The shares."""
+        return {"safe": self.safe, "unsafe": self.unsafe}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restore the shares."""
+        self.safe, self.unsafe = state_dict["safe"], state_dict["unsafe"]
+
+    def dumps(self, path: str | os.PathLike[str]) -> None:
+        """Write the shares into a folder."""
+        folder = Path(path)
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "sampler.json").write_text(json.dumps(self.state_dict()))
+
+    def loads(self, path: str | os.PathLike[str]) -> None:
+        """Read what ``dumps`` wrote."""
+        self.load_state_dict(json.loads((Path(path) / "sampler.json").read_text()))
+
+    def _empty(self) -> None:
+        """Nothing to forget."""
+
+
+__all__ = ["RegionSampler", "TransitionStore", "stratified_indices"]
