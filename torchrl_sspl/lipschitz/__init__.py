@@ -1,0 +1,1 @@
+from torchrl_sspl.lipschitz.sandwich import SandwichBarrier

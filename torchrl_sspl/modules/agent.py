@@ -193,7 +193,9 @@ class Agent(nn.Module):
             ) from error
         for name, value in agent.state_dict().items():
             if not torch.isfinite(value).all():
-                raise CheckpointError(f"expected finite weights in '{path}', received NaN or infinity in '{name}'; restore the files")
+                raise CheckpointError(
+                    f"expected finite weights in '{path}', received NaN or infinity in '{name}'; restore the files"
+                )
         return agent.to(device)
 
 

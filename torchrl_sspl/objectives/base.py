@@ -34,6 +34,7 @@ class LatentBatch:
         user_action: ``(*batch, action_dim)`` action of the user's policy, or ``None`` for zero.
         valid: ``(*batch, 1)`` bool, rows that count, or ``None`` for all.
         weights: ``(*batch, 1)`` priority weights, or ``None``.
+        residual: ``(*batch, p)`` error of the dynamics to add to predicted successors, or ``None``.
     """
 
     latent: Tensor
@@ -45,6 +46,7 @@ class LatentBatch:
     user_action: Tensor | None = None
     valid: Tensor | None = None
     weights: Tensor | None = None
+    residual: Tensor | None = None
 
     @property
     def shape(self) -> torch.Size:
@@ -119,6 +121,7 @@ class LatentLoss(LossModule):
             region: region code, 0 unlabelled, 1 safe, 2 unsafe.
             user_action: action of the user's policy, in physical units.
             priority_weight: weights of prioritised sampling.
+            residual: error of the dynamics to add to predicted successors, read where present.
         """
 
         observation: NestedKey = "pixels"
@@ -128,6 +131,7 @@ class LatentLoss(LossModule):
         region: NestedKey = "region"
         user_action: NestedKey = "user_action"
         priority_weight: NestedKey = "priority_weight"
+        residual: NestedKey = "residual"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
@@ -258,12 +262,14 @@ class LatentLoss(LossModule):
             self._in_keys.append(keys.frames)
         if "user_action" in self._needs:
             self._in_keys.append(keys.user_action)
+        if "residual" in self._needs:
+            self._in_keys.append(keys.residual)
         if self.use_prioritized_weights:
             self._in_keys.append(keys.priority_weight)
 
     @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
-        """Keys that the loss reads; frames and weights are optional."""
+        """Keys that the loss reads; frames, residual and weights are optional."""
         if self._in_keys is None:
             self._set_in_keys()
         assert self._in_keys is not None
@@ -272,6 +278,23 @@ class LatentLoss(LossModule):
     @in_keys.setter
     def in_keys(self, keys: list[NestedKey]) -> None:
         self._in_keys = keys
+
+    def select_out_keys(self, *out_keys: NestedKey) -> LatentLoss:
+        """Restricts the output to some of its entries.
+
+        Example:
+            >>> from torchrl_sspl.modules import Policy
+            >>> from torchrl_sspl.objectives import PolicyDeviationLoss
+            >>> loss = PolicyDeviationLoss(None, Policy(2, 1)).select_out_keys("loss_policy_deviation")
+            >>> loss.out_keys
+            ['loss_policy_deviation']
+        """
+        unknown = set(out_keys) - set(self.out_keys_source)
+        if unknown:
+            raise ConfigError(f"expected keys among {list(self.out_keys_source)}, received {sorted(unknown)}")
+        # TensorDict's own selection takes a batch without optional entries for a keyword call, and fails on it.
+        self._out_keys_apparent = list(out_keys)
+        return self
 
     # ------------------------------------------------------------------ networks
 
@@ -346,6 +369,9 @@ class LatentLoss(LossModule):
         valid = self._valid(tensordict)
         latents = self._encode(tensordict, valid, True, "next_latent" in needs, "online")
         batch = LatentBatch(latents[0], valid=valid)
+        if "residual" in needs:
+            residual = tensordict.get(keys.residual, None)
+            batch.residual = None if residual is None else _clean(residual, valid)
         if "next_latent" in needs:
             batch.next_latent = latents[1]
         now, after = "target_latent" in needs, "target_next_latent" in needs
@@ -373,9 +399,9 @@ class LatentLoss(LossModule):
                     f"expected {keys.region!r} of shape {(*batch.shape, 1)}, received "
                     f"{tuple(batch.region.shape)}; use sets.label"
                 )
-        weights = self._maybe_get_priority_weight(tensordict)
-        if weights is not None:
-            batch.weights = _batch_last(weights, batch.shape)
+        if self.use_prioritized_weights:
+            weights = tensordict.get(keys.priority_weight, None)
+            batch.weights = None if weights is None else _batch_last(weights, batch.shape)
         return batch
 
     # ------------------------------------------------------------------ output
@@ -414,7 +440,7 @@ class LatentLoss(LossModule):
         return self._reduce(statistic.expand(*batch.shape, 1), batch)
 
     def _pack(self, terms: dict[str, Tensor], tensordict: TensorDictBase) -> TensorDict:
-        output = TensorDict(terms, batch_size=[])
+        output = TensorDict({key: terms[key] for key in self.out_keys}, batch_size=[])
         self._clear_weakrefs(
             tensordict,
             output,

@@ -101,17 +101,28 @@ class InvariantSet:
 
 
 def robust_invariant_set(
-    successors: Tensor, candidates: Tensor, outside: Tensor, *, radius: float, max_iterations: int = 500
+    successors: Tensor,
+    candidates: Tensor,
+    outside: Tensor,
+    *,
+    radius: float,
+    residuals: Tensor | None = None,
+    max_iterations: int = 500,
 ) -> InvariantSet:
-    r"""Largest subset of the candidates that can be kept, whatever the latent error up to a radius.
+    r"""Largest subset of the candidates that can be kept, whatever the latent error among the given ones.
 
-    .. math:: K_{j+1} = \{ z_i \in K_j : \max_u \operatorname{dist}(d(z_i, u), \text{outside} \cup K_j^c) > \rho \}
+    .. math:: K_{j+1} = \{ z_i \in K_j : \max_u \min_e \operatorname{dist}(d(z_i, u) + e, \text{outside} \cup K_j^c) > \rho \}
+
+    The error e runs over the residuals that were observed near :math:`z_i`: the error of a model from pixels is far
+    from round (a velocity is seen less well than a position), and a ball as large as its longest axis would cost
+    most of the set.
 
     Args:
         successors: ``(n, k, p)`` predicted successors of every candidate under every action.
         candidates: ``(n, p)`` latents that carry no "unsafe" label.
         outside: ``(m, p)`` latents of the unsafe label.
-        radius: latent error that the set tolerates.
+        radius: latent distance that remains to everything outside, in every direction.
+        residuals: ``(n, j, p)`` observed errors of the dynamics near every candidate; none if not given.
         max_iterations: bound on the number of sweeps.
 
     Returns:
@@ -131,31 +142,58 @@ def robust_invariant_set(
         21
     """
     n, k, p = successors.shape
-    if candidates.shape != (n, p):
+    if candidates.shape != (n, p) or (residuals is not None and (residuals.shape[0], residuals.shape[2]) != (n, p)):
         raise ShapeError(
-            f"expected candidates of shape ({n}, {p}) for successors {tuple(successors.shape)}, received "
-            f"{tuple(candidates.shape)}; pass one row of successors per candidate"
+            f"expected candidates of shape ({n}, {p}) and residuals of shape ({n}, j, {p}) for successors "
+            f"{tuple(successors.shape)}, received {tuple(candidates.shape)} and "
+            f"{None if residuals is None else tuple(residuals.shape)}; pass one row per candidate"
         )
     if outside.shape[0] == 0:
         raise EmptyRegionError("expected at least one unsafe latent, received 0; label some observations unsafe")
     queries = successors.detach().cpu().numpy()
+    errors = np.zeros((n, 1, p), np.float32) if residuals is None else residuals.detach().cpu().numpy()
     inside = np.ones(n, dtype=bool)
     clearance = np.full((n, k), np.inf, dtype=np.float32)
     removed = outside
     iteration = 0
     for iteration in range(1, max_iterations + 1):
-        # Only the distance to what was removed last can lower a clearance: the tree stays small.
-        index = np.nonzero(inside)[0]
-        if not len(index):
-            break
-        distance = _tree(removed).query(queries[index].reshape(-1, p))[0].reshape(len(index), k)
-        clearance[index] = np.minimum(clearance[index], distance)
-        lost = index[clearance[index].max(1) <= radius]
+        # Only the distance to what was removed last can lower a clearance: the tree stays small. An action that
+        # has failed once never comes back.
+        tree = _tree(removed)
+        row, action = np.nonzero((clearance > radius) & inside[:, None])
+        for j in range(errors.shape[1]):
+            distance = tree.query(queries[row, action] + errors[row, j])[0]
+            clearance[row, action] = np.minimum(clearance[row, action], distance)
+            alive = clearance[row, action] > radius
+            row, action = row[alive], action[alive]
+        lost = np.nonzero(inside & (clearance.max(1) <= radius))[0]
         if not len(lost):
             break
         inside[lost] = False
         removed = candidates[torch.as_tensor(lost)]
     return InvariantSet(torch.as_tensor(inside), torch.as_tensor(clearance), iteration)
+
+
+def nearby_residuals(latent: Tensor, reference: Tensor, residual: Tensor, *, count: int) -> Tensor:
+    """Errors of the dynamics that were observed nearest to every latent.
+
+    Args:
+        latent: ``(n, p)``.
+        reference: ``(m, p)`` latents at which errors were observed.
+        residual: ``(m, p)`` errors, next latent minus predicted next latent.
+        count: errors per latent.
+
+    Returns:
+        ``(n, count, p)``.
+
+    Source: none.
+
+    Example:
+        >>> nearby_residuals(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]), torch.tensor([[0.1], [0.2]]), count=1)
+        tensor([[[0.2000]]])
+    """
+    index = _tree(reference).query(latent.detach().cpu().numpy(), k=count)[1]
+    return residual[torch.as_tensor(index).reshape(len(latent), count)]
 
 
 def barrier_targets(

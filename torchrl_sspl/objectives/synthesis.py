@@ -47,6 +47,9 @@ class SynthesisLoss(LatentLoss):
       where the state is outside;
     * ``worst_coeff``: adds the mean over the worst ``worst_fraction`` of the rows to the synthesis term.
 
+    A batch may hold ``"residual"`` ``(*batch, p)``, an observed error of the dynamics that is added to the successor:
+    the condition is then asked of what may really follow.
+
     Args:
         encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"``.
         dynamics: (latent, action) -> next latent ``(*batch, p)``.
@@ -152,6 +155,7 @@ class SynthesisLoss(LatentLoss):
             float(floor),
         )
         self.descent_scale = float(descent_scale)
+        self._needs.add("residual")
         if successor == "target":
             self._needs.add("target_latent")
         self.out_keys.append("loss_synthesis")
@@ -189,6 +193,11 @@ class SynthesisLoss(LatentLoss):
         successor = self._run(
             "dynamics", at, action, params="frozen" if "dynamics" in self.detach else "online"
         )
+        if batch.residual is not None:
+            # Uniform latents have no observed error.
+            error = batch.residual
+            error = torch.stack([error, torch.zeros_like(error)]) if stray else error
+            successor = (successor + error).clamp(-1.0, 1.0)
         if online:
             # One pass: the weights of a Lipschitz barrier are assembled on every call.
             barrier, barrier_next = self._run("barrier", torch.stack([origin, successor])).unbind(0)

@@ -77,7 +77,7 @@ class RepresentationConfig:
         clip_norm: bound on the gradient's norm.
     """
 
-    steps: int = 2500
+    steps: int = 4000
     batch: int = 192
     lr: float = 3e-3
     safety_margin: float = 0.3
@@ -102,7 +102,8 @@ class SynthesisConfig:
         exploration: standard deviation of the exploration, as a share of the largest action.
         dynamics_steps: optimiser steps of the refit of the latent dynamics.
         tube_radius: distance from the data up to which a latent off the manifold may belong to the safe set.
-        radius: latent error rho that the invariant set of the data tolerates.
+        radius: latent distance rho that the invariant set of the data keeps to everything outside.
+        residuals: observed errors of the dynamics that every successor must tolerate.
         actions: actions per dimension tried at every latent.
         fit_steps: steps in which barrier and policy are regressed onto their targets.
         steer_steps: steps of the policy alone on the condition, with the barrier held still.
@@ -123,12 +124,13 @@ class SynthesisConfig:
     exploration: float = 0.15
     dynamics_steps: int = 6000
     tube_radius: float = 0.3
-    radius: float = 0.03
+    radius: float = 0.015
+    residuals: int = 8
     actions: int = 21
     fit_steps: int = 3000
     steer_steps: int = 1000
     tune_steps: int = 2000
-    margin: float = 0.03
+    margin: float = 0.015
     band: float = 0.1
     batch: int = 1024
     lr: float = 1e-3
@@ -239,7 +241,9 @@ def make_config(overrides: Sequence[str] = (), **defaults: Any) -> TrainingConfi
     for item in overrides:
         key, sign, value = item.partition("=")
         if not sign or not key:
-            raise ConfigError(f"expected an argument of the form key=value, received '{item}'; e.g. seed=1 out_dir=runs/a")
+            raise ConfigError(
+                f"expected an argument of the form key=value, received '{item}'; e.g. seed=1 out_dir=runs/a"
+            )
         pairs[key.strip()] = value.strip()
     preset = pairs.get("preset", str(defaults.get("preset", "sound")))
     if preset not in PRESETS:
@@ -262,8 +266,18 @@ def _apply_preset(config: TrainingConfig) -> None:
         config.data = DataConfig(transitions=600, safe=150, unsafe=200)
         config.representation.steps, config.representation.batch = 30, 48
         config.synthesis = SynthesisConfig(
-            rounds=2, transitions=800, rollout_transitions=200, dynamics_steps=60, fit_steps=60, steer_steps=20, tune_steps=40,
-            actions=5, batch=128, radius=0.0, check_episodes=40, check_horizon=5,
+            rounds=2,
+            transitions=800,
+            rollout_transitions=200,
+            dynamics_steps=60,
+            fit_steps=60,
+            steer_steps=20,
+            tune_steps=40,
+            actions=5,
+            batch=128,
+            radius=0.0,
+            check_episodes=40,
+            check_horizon=5,
         )
         config.evaluation = EvaluationConfig(grid=21, kernel_grid=101, rollouts=40, horizon=20, gymnasium_rollouts=0)
 

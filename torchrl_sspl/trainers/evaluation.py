@@ -290,17 +290,42 @@ def evaluate(
     safe_barrier = agent.barrier(see(safe_grid))[:, 0]
     out.add(share("safe_called_unsafe", int((safe_barrier > 0).sum()), len(safe_barrier), "uniform samples of S"))
     out.add(share("volume_over_kernel", int((member & viable).sum()), n_viable, f"true kernel, {on_grid}"))
-    out.add(share("false_safe", int((member & ~viable).sum()), n_member, f"{{B<=0}} outside the true kernel, {on_grid}"))
+    out.add(
+        share("false_safe", int((member & ~viable).sum()), n_member, f"{{B<=0}} outside the true kernel, {on_grid}")
+    )
     doomed = ~unsafe & ~viable
-    out.add(share("false_safe_of_doomed", int((member & doomed).sum()), int(doomed.sum()), f"states outside U and the kernel, {on_grid}"))
-    out.add(Measurement("worst_safe_barrier", float(safe_barrier.max()), "barrier", len(safe_barrier), note="q1: largest B on S"))
-    out.add(Measurement("worst_unsafe_barrier", float(-barrier[unsafe].min()), "barrier", int(unsafe.sum()), note="q2: largest -B on U"))
+    out.add(
+        share(
+            "false_safe_of_doomed",
+            int((member & doomed).sum()),
+            int(doomed.sum()),
+            f"states outside U and the kernel, {on_grid}",
+        )
+    )
+    out.add(
+        Measurement(
+            "worst_safe_barrier", float(safe_barrier.max()), "barrier", len(safe_barrier), note="q1: largest B on S"
+        )
+    )
+    out.add(
+        Measurement(
+            "worst_unsafe_barrier",
+            float(-barrier[unsafe].min()),
+            "barrier",
+            int(unsafe.sum()),
+            note="q2: largest -B on U",
+        )
+    )
     out.add(Measurement("barrier_depth", float(-barrier.min()), "barrier", note="|min B| on the grid"))
     out.arrays.update(states=states, latent=latent, barrier=barrier, viable=viable, unsafe=unsafe)
 
     # Lipschitz constants.
     lower = lipschitz_lower(agent.barrier, -1.0, 1.0, n=20000, generator=generator)
-    out.add(Measurement("lipschitz_certified", agent.lipschitz_bound, "barrier / latent", note="proved for the deployed weights"))
+    out.add(
+        Measurement(
+            "lipschitz_certified", agent.lipschitz_bound, "barrier / latent", note="proved for the deployed weights"
+        )
+    )
     out.add(Measurement("lipschitz_sampled", lower, "barrier / latent", 20000, note="largest gradient or secant found"))
     out.add(Measurement("lipschitz_ratio", lower / agent.lipschitz_bound, "ratio", note="sampled over certified"))
 
@@ -310,12 +335,20 @@ def evaluate(
     end = env.wrap(env.dynamics(start, action))
     observer = _Observer(agent, env, draw or env.draw)
     z, z_next = observer.start(env.previous_state(start), start), observer.next(end)
-    _quantiles(out, "random_action_error", (agent.dynamics(z, action) - z_next).norm(dim=-1), "latent", "uniform states and actions")
+    _quantiles(
+        out,
+        "random_action_error",
+        (agent.dynamics(z, action) - z_next).norm(dim=-1),
+        "latent",
+        "uniform states and actions",
+    )
 
     # Episodes from the learned safe set.
     starts = _sample_where(inside, env.state_space, n_rollouts, generator)
     if len(starts):
-        episodes = rollout(agent, env, starts, config.horizon, draw=draw, progress=progress, label="episodes from {B<=0}")
+        episodes = rollout(
+            agent, env, starts, config.horizon, draw=draw, progress=progress, label="episodes from {B<=0}"
+        )
         touched = env.unsafe_set.contains(episodes.states).any(0)
         left = (episodes.barrier > 0).any(0)
         note = f"episodes of {config.horizon} steps from {{B<=0}}"
@@ -323,10 +356,26 @@ def evaluate(
         out.add(share("safe_rollouts_leave", int(left.sum()), len(starts), note))
         _quantiles(out, "on_policy_error", episodes.prediction_error.amax(0), "latent", "largest error of an episode")
         _quantiles(out, "on_policy_step_error", episodes.prediction_error.flatten(), "latent", "error of a step")
-        _quantiles(out, "barrier_error", episodes.barrier_error.amax(0), "barrier", "largest B(E(o')) - B(d(z,u)) of an episode")
+        _quantiles(
+            out,
+            "barrier_error",
+            episodes.barrier_error.amax(0),
+            "barrier",
+            "largest B(E(o')) - B(d(z,u)) of an episode",
+        )
         one_step = episodes.barrier[1][episodes.barrier[0] <= 0]
-        out.add(Measurement("worst_next_barrier", float(one_step.max()), "barrier", len(one_step), note="R3: largest B after one step from {B<=0}"))
-        out.arrays.update(trajectories=episodes.states[:, :64], torques=episodes.actions[:, :64], traces=episodes.barrier[:, :64])
+        out.add(
+            Measurement(
+                "worst_next_barrier",
+                float(one_step.max()),
+                "barrier",
+                len(one_step),
+                note="R3: largest B after one step from {B<=0}",
+            )
+        )
+        out.arrays.update(
+            trajectories=episodes.states[:, :64], torques=episodes.actions[:, :64], traces=episodes.barrier[:, :64]
+        )
     else:
         for name in ("safe_rollouts_touch_unsafe", "safe_rollouts_leave"):
             out.add(share(name, 0, 0, "{B<=0} is empty"))
@@ -334,15 +383,31 @@ def evaluate(
     # Episodes from U, where a return is possible at all.
     recoverable = recoverable_set(env, kernel)
     n_back = max(1, n_rollouts // 5)
-    unsafe_starts = _sample_where(lambda x: env.unsafe_set.contains(x) & recoverable.contains(x), env.state_space, n_back, generator)
+    unsafe_starts = _sample_where(
+        lambda x: env.unsafe_set.contains(x) & recoverable.contains(x), env.state_space, n_back, generator
+    )
     episodes = rollout(agent, env, unsafe_starts, config.horizon, draw=draw, progress=progress, label="episodes from U")
     back = (episodes.barrier[-1] <= 0) & ~env.unsafe_set.contains(episodes.states[-1])
-    out.add(share("unsafe_rollouts_return", int(back.sum()), len(unsafe_starts), "recoverable starts in U that end in {B<=0} and outside U"))
+    out.add(
+        share(
+            "unsafe_rollouts_return",
+            int(back.sum()),
+            len(unsafe_starts),
+            "recoverable starts in U that end in {B<=0} and outside U",
+        )
+    )
     out.arrays.update(recovery=episodes.states[:, :32], recovery_torques=episodes.actions[:, :32])
     safe_starts = env.sample_states(n_back, generator=generator, region=env.safe_set)
     episodes = rollout(agent, env, safe_starts, config.horizon, draw=draw, progress=progress, label="episodes from S")
     touched = env.unsafe_set.contains(episodes.states).any(0)
-    out.add(share("labelled_safe_rollouts_touch_unsafe", int(touched.sum()), len(safe_starts), f"episodes of {config.horizon} steps from S"))
+    out.add(
+        share(
+            "labelled_safe_rollouts_touch_unsafe",
+            int(touched.sum()),
+            len(safe_starts),
+            f"episodes of {config.horizon} steps from S",
+        )
+    )
     return out
 
 

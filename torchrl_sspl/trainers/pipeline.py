@@ -9,10 +9,9 @@ passed them is what the training returns.
 from __future__ import annotations
 
 import copy
-import csv
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,23 +19,25 @@ from typing import Any
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
-from torchrl_sspl.data import collect_random, collect_rollouts
+from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy, make_rollout_policy
-from torchrl_sspl.modules.agent import Agent, mlp_barrier
+from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.objectives import SaLaDLoss, SynthesisLoss
-from torchrl_sspl.objectives.target import TargetLoss
 from torchrl_sspl.objectives.latent_viability import (
     barrier_targets,
+    nearby_residuals,
     nearest_distance,
     normal_projectors,
     reach_times,
     robust_invariant_set,
 )
+from torchrl_sspl.objectives.target import TargetLoss
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
@@ -125,9 +126,7 @@ class SafePolicyTraining:
             self.encoder = FrameEncoder(
                 net.latent_dim, self.env.image_size, pool_to=net.pool_to, velocity_gain=net.velocity_gain
             )
-            self.warm_dynamics = LatentDynamics(
-                net.latent_dim, self.env.action_dim, (128, 128), self.env.max_action
-            )
+            self.warm_dynamics = LatentDynamics(net.latent_dim, self.env.action_dim, (128, 128), self.env.max_action)
             self.warm_barrier = self._new_barrier()
             self.inverse = InverseDynamics(net.latent_dim, self.env.action_dim, action_scale=self.env.max_action)
             self.dynamics = LatentDynamics(
@@ -182,7 +181,10 @@ class SafePolicyTraining:
         # One bar over all phases, in units of optimiser steps, so that its estimate of the time left means something.
         sizes = [self._size(name) for name, _ in phases]
         self._bar = tqdm(
-            total=sum(sizes), initial=sum(sizes[: self.phase]) + self.step, disable=not self.config.progress, unit="step"
+            total=sum(sizes),
+            initial=sum(sizes[: self.phase]) + self.step,
+            disable=not self.config.progress,
+            unit="step",
         )
         while self.phase < len(phases):
             name, number = phases[self.phase]
@@ -213,10 +215,12 @@ class SafePolicyTraining:
         loss: Callable[[], TensorDict],
         *,
         clip: float | None = None,
-        update: Callable[[], None] | None = None,
+        delayed: nn.Module | None = None,
     ) -> None:
         """Optimiser steps of one phase; interrupted at any of them, it continues as if nothing had happened."""
         modules = list(optimisers)
+        # theta^-, where the loss keeps it.
+        updater = None if delayed is None else SoftUpdate(delayed, tau=self.config.representation.target_tau)
         adam = torch.optim.Adam([{"params": list(m.parameters()), "lr": lr} for m, lr in optimisers.items()])
         cycle = torch.optim.lr_scheduler.OneCycleLR(
             adam, [lr for lr in optimisers.values()], total_steps=max(steps, 2), pct_start=0.1
@@ -227,6 +231,8 @@ class SafePolicyTraining:
             cycle.load_state_dict(self._loop_state["schedule"])
             self.generator.set_state(self._loop_state["generator"])
             torch.set_rng_state(self._loop_state["global_rng"])
+            if delayed is not None:
+                delayed.load_state_dict(self._loop_state["delayed"])
         else:
             torch.manual_seed(int(torch.randint(2**31, (1,), generator=self.generator)))
         while self.step < steps:
@@ -239,8 +245,8 @@ class SafePolicyTraining:
                 nn.utils.clip_grad_norm_(parameters, clip)
             adam.step()
             cycle.step()
-            if update is not None:
-                update()
+            if updater is not None:
+                updater.step()
             self.step += 1
             self._bar.update()
             if self.step % 100 == 0 or self.step == steps:
@@ -257,6 +263,7 @@ class SafePolicyTraining:
                     "schedule": cycle.state_dict(),
                     "generator": self.generator.get_state(),
                     "global_rng": torch.get_rng_state(),
+                    "delayed": None if delayed is None else delayed.state_dict(),
                 }
                 self._checkpoint()
 
@@ -267,38 +274,53 @@ class SafePolicyTraining:
 
     def _phase_represent(self, _: int) -> None:
         """Warm start: SaLaD on random-action data, of which every frame is stored once."""
-        data, rep = self.config.data, self.config.representation
-        seed = self.config.seed
-        stores = {
-            "any": collect_random(self._env_for(), round(data.transitions * (1 - data.buffer_share)), seed=seed,
-                                  steps=data.episode_steps),
-            "buffer": collect_random(self._env_for(), round(data.transitions * data.buffer_share), seed=seed + 1,
-                                     steps=data.episode_steps, region=self._buffer_region()),
-            "safe": collect_random(self._env_for(), data.safe, seed=seed + 2, steps=1, region=self.env.safe_set),
-            "unsafe": collect_random(self._env_for(), data.unsafe, seed=seed + 3, steps=1, region=self.env.unsafe_set),
-        }
+        rep = self.config.representation
+        stores = self._labelled_stores()
         loss = SaLaDLoss(
-            self.encoder, self.warm_dynamics, self.warm_barrier,
+            self.encoder,
+            self.warm_dynamics,
+            self.warm_barrier,
             inverse_dynamics=self.inverse,
             consistency=rep.consistency_target,
             safety_margin=rep.safety_margin,
-            safe_coeff=rep.label_coeff, unsafe_coeff=rep.label_coeff,
+            safe_coeff=rep.label_coeff,
+            unsafe_coeff=rep.label_coeff,
             consistency_coeff=rep.consistency_coeff,
             inverse_dynamics_coeff=rep.inverse_coeff,
             variance_coeff=rep.variance_coeff,
             covariance_coeff=rep.variance_coeff,
-            saturation_coeff=rep.saturation_coeff, saturation_limit=0.905,
+            saturation_coeff=rep.saturation_coeff,
+            saturation_limit=0.905,
         )
-        labelled = rep.batch // 6
-        mixed = rep.batch - 2 * labelled
-        share = {"any": mixed // 2, "buffer": mixed - mixed // 2, "safe": labelled, "unsafe": labelled}
-
-        def step() -> TensorDict:
-            batch = torch.cat([stores[k].sample(n, generator=self.generator) for k, n in share.items()])
-            return loss(batch.to(self.device))
-
         networks = dict.fromkeys((self.encoder, self.warm_dynamics, self.warm_barrier, self.inverse), rep.lr)
-        self._loop(rep.steps, networks, step, clip=rep.clip_norm)
+        delayed = loss if rep.consistency_target == "target" else None
+        self._loop(rep.steps, networks, lambda: loss(self._mixed_batch(stores)), clip=rep.clip_norm, delayed=delayed)
+
+    def _labelled_stores(self) -> dict[str, TransitionStore]:
+        """Random-action data of the warm start; a function of the seed alone, so it need not be saved."""
+        data, seed = self.config.data, self.config.seed
+        return {
+            "any": collect_random(
+                self._env_for(), round(data.transitions * (1 - data.buffer_share)), seed=seed, steps=data.episode_steps
+            ),
+            "buffer": collect_random(
+                self._env_for(),
+                round(data.transitions * data.buffer_share),
+                seed=seed + 1,
+                steps=data.episode_steps,
+                region=self._buffer_region(),
+            ),
+            "safe": collect_random(self._env_for(), data.safe, seed=seed + 2, steps=1, region=self.env.safe_set),
+            "unsafe": collect_random(self._env_for(), data.unsafe, seed=seed + 3, steps=1, region=self.env.unsafe_set),
+        }
+
+    def _mixed_batch(self, stores: dict[str, TransitionStore]) -> TensorDict:
+        """Two thirds of D, a sixth each of S and U."""
+        labelled = self.config.representation.batch // 6
+        mixed = self.config.representation.batch - 2 * labelled
+        share = {"any": mixed // 2, "buffer": mixed - mixed // 2, "safe": labelled, "unsafe": labelled}
+        batch = torch.cat([stores[k].sample(n, self.generator) for k, n in share.items()])
+        return batch.to(self.device)
 
     def _phase_gather(self, number: int) -> None:
         """Encoded transitions: random actions in the first round, the policy's own afterwards."""
@@ -317,13 +339,16 @@ class SafePolicyTraining:
 
     def _near_the_set(self, n: int, seed: int) -> dict[str, Tensor]:
         """Transitions of the exploring policy that start in the set or within 0.2 of it."""
-        explore = self.config.synthesis.exploration * self.env.max_action
-        policy = make_rollout_policy(self.encoder, self.policy)
+        policy = _Exploring(
+            make_rollout_policy(self.encoder, self.policy),
+            self.config.synthesis.exploration * self.env.max_action,
+            torch.Generator().manual_seed(seed),
+        )
         found: list[dict[str, Tensor]] = []
         count = 0
         for attempt in range(10):
             store = collect_rollouts(
-                self._env_for(), policy, n, seed=seed + attempt, steps=4, region=self._buffer_region(), noise=explore
+                self._env_for(), policy, n, seed=seed + attempt, steps=4, region=self._buffer_region()
             )
             part = self._encode_store(store)
             with torch.no_grad():
@@ -351,7 +376,11 @@ class SafePolicyTraining:
                 dynamics_error_max=error.detach().max().sqrt(),
             )
 
-        self._loop(s.dynamics_steps if number == 0 else s.dynamics_steps // 2, {self.dynamics: 3e-3 if number == 0 else 2e-3}, step)
+        self._loop(
+            s.dynamics_steps if number == 0 else s.dynamics_steps // 2,
+            {self.dynamics: 3e-3 if number == 0 else 2e-3},
+            step,
+        )
 
     def _phase_fit(self, number: int) -> None:
         """Barrier and policy onto the robust invariant set of the encoded data."""
@@ -369,7 +398,9 @@ class SafePolicyTraining:
 
     def _phase_steer(self, number: int) -> None:
         """The policy alone, on the condition with twice the margin."""
-        self._condition_phase(number, self.config.synthesis.steer_steps, {self.policy: 3e-3}, 2 * self.config.synthesis.margin)
+        self._condition_phase(
+            number, self.config.synthesis.steer_steps, {self.policy: 3e-3}, 2 * self.config.synthesis.margin
+        )
 
     def _phase_tune(self, number: int) -> None:
         """Barrier and policy together, on the condition, the labels and the targets."""
@@ -385,23 +416,41 @@ class SafePolicyTraining:
         outside_weight = table["action_weight"] * torch.where(table["inside"], 0.1, 1.0)
         table["action_weight"] = outside_weight
         synthesis = SynthesisLoss(
-            None, self.dynamics, self.barrier, self.policy,
-            mode="R3", dynamics_margin=margin, band=s.band, worst_coeff=1.0, worst_fraction=0.02,
+            None,
+            self.dynamics,
+            self.barrier,
+            self.policy,
+            mode="R3",
+            dynamics_margin=margin,
+            band=s.band,
+            worst_coeff=1.0,
+            worst_fraction=0.02,
             off_manifold_coeff=1.0,
         )
         target = TargetLoss(
-            self.barrier, self.policy,
-            action_scale=self.env.max_action, outside_cap=s.band, policy_coeff=s.recovery_coeff,
-            safety_margin=s.unsafe_margin, unsafe_coeff=3.0, safe_coeff=1.0, worst_coeff=0.3, worst_fraction=0.05,
+            self.barrier,
+            self.policy,
+            action_scale=self.env.max_action,
+            outside_cap=s.band,
+            policy_coeff=s.recovery_coeff,
+            safety_margin=s.unsafe_margin,
+            unsafe_coeff=3.0,
+            safe_coeff=1.0,
+            worst_coeff=0.3,
+            worst_fraction=0.05,
         )
 
         def step() -> TensorDict:
             rows = torch.cat(
-                [self._pick(len(table), s.batch), unsafe[self._pick(len(unsafe), s.batch)],
-                 safe[self._pick(len(safe), s.batch // 4)]]
+                [
+                    self._pick(len(table), s.batch),
+                    unsafe[self._pick(len(unsafe), s.batch)],
+                    safe[self._pick(len(safe), s.batch // 4)],
+                ]
             )
-            latents = TensorDict(latent=rim[self._pick(len(rim), 3 * s.batch // 2)], batch_size=[3 * s.batch // 2])
-            terms = synthesis(latents)
+            asked = rim[self._pick(len(rim), 3 * s.batch // 2)]
+            error = asked["residual"][torch.arange(len(asked)), self._pick(s.residuals, len(asked))]
+            terms = synthesis(asked.exclude("residual").set("residual", error))
             terms.update(target(table[rows]))
             return terms
 
@@ -438,8 +487,14 @@ class SafePolicyTraining:
             touched = int(((episodes.barrier <= level) & late).any(0).sum())
             returned = float(((back.barrier[-1] <= level) & ~env.unsafe_set.contains(back.states[-1])).float().mean())
             size = float((value <= level).float().mean())
-            faults = [f"{k} {v}" for k, v in (("unsafe inside", bad), ("safe outside", out), ("left", left), ("touched U", touched)) if v]
-            return Check(number, level, bad, out, left, touched, returned, size, not faults and size > 0, ", ".join(faults))
+            faults = [
+                f"{k} {v}"
+                for k, v in (("unsafe inside", bad), ("safe outside", out), ("left", left), ("touched U", touched))
+                if v
+            ]
+            return Check(
+                number, level, bad, out, left, touched, returned, size, not faults and size > 0, ", ".join(faults)
+            )
 
         levels = torch.linspace(-0.2, 0.08, 57).flip(0).tolist()
         chosen = next((c for level in levels if (c := check(level, guard)).passed), check(0.0, guard))
@@ -474,7 +529,7 @@ class SafePolicyTraining:
         cloud = torch.cat([self.latents["latent"], self.latents["next_latent"]])
         return cloud[torch.randperm(len(cloud), generator=generator)[:80000]]
 
-    def _targets(self, number: int) -> tuple[TensorDict, Tensor]:
+    def _targets(self, number: int) -> tuple[TensorDict, TensorDict]:
         """Latents with the targets of barrier and policy, and the latents on which the condition is asked."""
         if getattr(self, "_target_round", None) == number:
             return self._target_table, self._rim
@@ -485,7 +540,11 @@ class SafePolicyTraining:
         unsafe = region == UNSAFE
         allowed = ~unsafe
         zc = z[allowed]
-        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], radius=s.radius)
+        with torch.no_grad():
+            residual = data["next_latent"] - self.dynamics(z, data["action"])
+        sample = torch.randperm(len(z), generator=g)[:30000]
+        near = nearby_residuals(zc, z[sample], residual[sample], count=s.residuals)
+        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], radius=s.radius, residuals=near)
         if not bool(found.inside.any()):
             raise ConfigError(
                 f"expected a robust invariant set of the data at synthesis.radius={s.radius}, found none in {len(zc)} "
@@ -496,11 +555,14 @@ class SafePolicyTraining:
         stray = torch.rand(60000, z.shape[1], generator=g) * 2 - 1
         far = nearest_distance(stray, self._cloud(g)) > s.tube_radius
         tube, _ = self._tube(z, 2 * s.tube_radius, 1000 + number)
-        rim, _ = self._tube(zc, 1.2 * s.tube_radius, 2000 + number)
+        rim, rows = self._tube(zc, 1.2 * s.tube_radius, 2000 + number)
         queries = torch.cat([z, data["next_latent"], tube, stray])
         target, member = barrier_targets(
-            queries, z[inside], torch.cat([z[~inside], stray[far]]),
-            tube_radius=s.tube_radius, lipschitz_bound=self.config.network.lipschitz_bound,
+            queries,
+            z[inside],
+            torch.cat([z[~inside], stray[far]]),
+            tube_radius=s.tube_radius,
+            lipschitz_bound=self.config.network.lipschitz_bound,
         )
         # Actions: inside, what keeps the largest clearance; outside, what leads back soonest.
         best = torch.zeros(len(z), self.env.action_dim)
@@ -521,7 +583,9 @@ class SafePolicyTraining:
             region=torch.cat([data["region"], torch.zeros(rest, 1, dtype=torch.int64)]),
             batch_size=[len(queries)],
         )
-        self._rim = torch.cat([zc, rim])
+        self._rim = TensorDict(
+            latent=torch.cat([zc, rim]), residual=torch.cat([near, near[rows]]), batch_size=[len(zc) + len(rim)]
+        )
         self._target_round = number
         self._log({"step": number, "inside_of_allowed": float(found.inside.float().mean()), "sweeps": found.iterations})
         return self._target_table, self._rim
@@ -557,7 +621,7 @@ class SafePolicyTraining:
     def _encode_store(self, store) -> dict[str, Tensor]:
         parts = []
         for index in torch.arange(len(store)).split(_ENCODE_CHUNK):
-            batch = store[index]
+            batch = store.get(index)
             latent = self.encoder.sequence(batch["frames"])
             parts.append((latent[:, 0], batch["action"], latent[:, 1], batch["region"]))
         names = ("latent", "action", "next_latent", "region")
@@ -572,8 +636,12 @@ class SafePolicyTraining:
         with torch.no_grad():
             barrier[-1].bias -= level
         return Agent(
-            copy.deepcopy(self.encoder), copy.deepcopy(self.dynamics), barrier, copy.deepcopy(self.policy),
-            net.lipschitz_bound, self._description(),
+            copy.deepcopy(self.encoder),
+            copy.deepcopy(self.dynamics),
+            barrier,
+            copy.deepcopy(self.policy),
+            net.lipschitz_bound,
+            self._description(),
         )
 
     def _description(self) -> dict[str, Any]:
@@ -584,7 +652,9 @@ class SafePolicyTraining:
                 "encoder": {
                     "class": "FrameEncoder",
                     "arguments": {
-                        "latent_dim": net.latent_dim, "image_size": env.image_size, "pool_to": net.pool_to,
+                        "latent_dim": net.latent_dim,
+                        "image_size": env.image_size,
+                        "pool_to": net.pool_to,
                         "velocity_gain": net.velocity_gain,
                     },
                 },
@@ -667,6 +737,19 @@ class SafePolicyTraining:
         self.generator.set_state(body["generator"])
         self.phase, self.step, self.seconds = body["phase"], body["step"], body["seconds"]
         self._loop_state = body["loop"]
+
+
+class _Exploring:
+    """Rollout policy with Gaussian noise on its actions; the environment clamps them."""
+
+    def __init__(self, policy: nn.Module, scale: float, generator: torch.Generator) -> None:
+        self.policy, self.scale, self.generator = policy, scale, generator
+
+    @torch.no_grad()
+    def __call__(self, tensordict: TensorDict) -> TensorDict:
+        action = self.policy(tensordict.select("pixels"))["action"]
+        noise = self.scale * torch.randn(action.shape, generator=self.generator)
+        return tensordict.set("action", action + noise)
 
 
 def _finite(value: float) -> bool:
