@@ -292,7 +292,7 @@ class LatentLoss(LossModule):
         unknown = set(out_keys) - set(self.out_keys_source)
         if unknown:
             raise ConfigError(f"expected keys among {list(self.out_keys_source)}, received {sorted(unknown)}")
-        # TensorDict's own selection takes a batch without optional entries for a keyword call, and fails on it.
+        # TensorDict's own selection takes a batch without optional entries for a keyword call, and fails.
         self._out_keys_apparent = list(out_keys)
         return self
 

@@ -47,8 +47,8 @@ class SynthesisLoss(LatentLoss):
       where the state is outside;
     * ``worst_coeff``: adds the mean over the worst ``worst_fraction`` of the rows to the synthesis term.
 
-    A batch may hold ``"residual"`` ``(*batch, p)``, an observed error of the dynamics that is added to the successor:
-    the condition is then asked of what may really follow.
+    A batch may hold ``"residual"`` ``(*batch, p)``, an observed error of the dynamics that is added to
+    the successor: the condition is then asked of what may really follow.
 
     Args:
         encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"``.
