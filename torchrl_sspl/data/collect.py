@@ -148,7 +148,7 @@ def collect_rollouts(
         store = TransitionStore(n, keep_state=keep_state)
     if isinstance(env, EnvBase) and seed is not None:
         env.set_seed(seed)  # before the collector resets it
-    width = env.numel() if isinstance(env, EnvBase) else 1
+    width = (env if isinstance(env, EnvBase) else env()).numel()
     options = {"backend": "direct", "frames_per_batch": max(1, min(-(-n // width), _BATCH // width)) * width}
     options.update(collector)
     if options["backend"] == "direct":

@@ -1,0 +1,87 @@
+"""Collection through TorchRL collectors: exact numbers, seeds, start sets, episodes."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule
+
+from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.sets import SAFE
+
+
+@pytest.fixture
+def env():
+    return PendulumEnv(batch_size=[8], image_size=16, seed=0)
+
+
+@pytest.mark.parametrize("n", [1, 50, 203])
+def test_exactly_n_transitions_are_collected(env, n):
+    assert len(collect_random(env, n, seed=0)) == n
+
+
+def test_transitions_are_the_environments(env):
+    data = collect_random(env, 300, seed=0, keep_state=True).get(slice(None))
+    state, following = data["info", "state"], data["info", "next_state"]
+    torch.testing.assert_close(env.wrap(env.dynamics(state, data["action"])), following)
+    assert torch.equal(data["frames"][:, :2].flatten(1, 2), env.observe(state))
+    assert torch.equal(data["frames"][:, 2], env.draw(following))
+    assert torch.equal(data["region"], env.region(state))
+    assert torch.equal(data["next", "region"], env.region(following))
+    assert torch.equal(data["next", "terminated"], following[:, 1:].abs() > 3.5)
+
+
+def test_random_actions_fill_their_bounds(env):
+    action = collect_random(env, 500, seed=0).get(slice(None))["action"]
+    assert action.abs().max() <= 10
+    assert action.max() > 9
+    assert action.min() < -9
+    assert action.mean().abs() < 1
+
+
+def test_the_same_seed_gives_the_same_data(env):
+    first, again = collect_random(env, 120, seed=3), collect_random(env, 120, seed=3)
+    other = collect_random(env, 120, seed=4)
+    assert (first.get(slice(None)) == again.get(slice(None))).all()
+    assert not torch.equal(first.get(slice(None))["action"], other.get(slice(None))["action"])
+
+
+def test_episodes_start_in_the_region_and_the_environment_is_left_as_it_was(env):
+    before = env.initial_set
+    store = collect_random(env, 100, seed=0, steps=1, region=env.safe_set)
+    assert (store.get(slice(None))["region"] == SAFE).all()
+    assert store.n_frames == 300  # independent transitions share no frame
+    assert env.initial_set is before
+    assert len(env.rollout(2)) == 8  # it still runs
+
+
+def test_episodes_are_no_longer_than_asked(env):
+    store = collect_random(env, 80, seed=0, steps=10, region=env.safe_set, keep_state=True)
+    state = store.get(slice(None))["info", "state"].reshape(8, 10, 2)
+    assert env.safe_set.contains(state[:, 0]).all()
+
+
+def test_rollouts_follow_the_policy_and_add_to_a_store(env):
+    policy = TensorDictModule(lambda pixels: pixels[:, 0, 0, :1].float() * 0 + 2.5, ["pixels"], ["action"])
+    store = TransitionStore(500)
+    collect_random(env, 60, seed=0, store=store)
+    same = collect_rollouts(env, policy, 90, seed=1, steps=20, region=env.safe_set, store=store)
+    assert same is store
+    assert len(store) == 150
+    assert (store.get(slice(60, 150))["action"] == 2.5).all()
+
+
+def test_an_environment_function_works(env):
+    store = collect_random(lambda: PendulumEnv(batch_size=[4], image_size=16), 30, seed=0)
+    assert len(store) == 30
+
+
+def test_bad_arguments_are_named(env):
+    with pytest.raises(ConfigError, match="n >= 1"):
+        collect_random(env, 0)
+    with pytest.raises(ConfigError, match="steps"):
+        collect_random(env, 5, steps=0)
+    with pytest.raises(ConfigError, match="region"):
+        collect_random(lambda: env, 5, region=env.safe_set)
