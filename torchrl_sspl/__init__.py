@@ -1,5 +1,46 @@
-"""Safe policies from pixels with barrier certificates that are checked, for TorchRL."""
+"""Safe policies from pixels with barrier certificates that are checked, for TorchRL.
+
+The names below are loaded when they are first used, so that ``import torchrl_sspl`` stays light.
+
+Example:
+    >>> import torchrl_sspl as sspl
+    >>> sspl.envs.PendulumEnv(batch_size=[4], seed=0).reset()["pixels"].shape
+    torch.Size([4, 6, 64, 64])
+"""
 
 from __future__ import annotations
 
+import importlib
+from typing import Any
+
 __version__ = "0.1.0"
+
+_SUBPACKAGES = ("certification", "data", "envs", "errors", "functional", "lipschitz", "modules", "objectives", "sets", "trainers", "viz")
+_NAMES = {
+    "Agent": "modules.agent",
+    "load": "modules.agent",
+    "SaLaD": "modules",
+    "SandwichBarrier": "lipschitz",
+    "SSPLLoss": "objectives",
+    "SaLaDLoss": "objectives",
+    "SynthesisLoss": "objectives",
+    "PolicyDeviationLoss": "objectives",
+    "LipschitzLoss": "objectives",
+    "viability_kernel": "certification.ground_truth",
+    "recoverable_set": "certification.ground_truth",
+    "evaluate": "trainers.evaluation",
+}
+
+__all__ = ["__version__", *_NAMES, *_SUBPACKAGES]  # noqa: PLE0604
+
+
+def __getattr__(name: str) -> Any:
+    if name in _SUBPACKAGES:
+        return importlib.import_module(f"torchrl_sspl.{name}")
+    if name in _NAMES:
+        return getattr(importlib.import_module(f"torchrl_sspl.{_NAMES[name]}"), name)
+    raise AttributeError(f"module 'torchrl_sspl' has no attribute '{name}'; it has {', '.join(sorted(__all__))}")
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)
