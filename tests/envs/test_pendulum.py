@@ -227,3 +227,16 @@ def test_bad_states_and_actions_are_named():
         env.observe(torch.zeros(2, 2), torch.zeros(3, 2))
     with pytest.raises(ConfigError, match="state"):
         env.reset(TensorDict({}, [1]), set_state=True)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+def test_frames_and_dynamics_are_the_same_on_the_gpu():
+    cpu, gpu = PendulumEnv(batch_size=[16]), PendulumEnv(batch_size=[16], device="cuda", seed=0)
+    check_env_specs(gpu)
+    state = cpu.sample_states(16, torch.Generator().manual_seed(0))
+    difference = gpu.observe(state.cuda()).cpu().int() - cpu.observe(state).int()
+    assert difference.abs().max() <= 24  # a corner may round to the next pixel
+    assert (difference != 0).float().mean() < 0.01
+    assert gpu.sample_states(3, torch.Generator().manual_seed(0)).is_cuda
+    assert gpu.rollout(3, break_when_any_done=False)["pixels"].is_cuda

@@ -188,7 +188,8 @@ class SafetyEnv(EnvBase):
             region (Region, optional): where to draw from, for example ``env.safe_set``.
         """
         chosen = self.initial_set if region is None else region
-        return chosen.sample(n, generator=generator or self._generator, device=self.device)
+        generator = generator or self._generator
+        return chosen.sample(n, generator=generator, device=generator.device).to(self.device)
 
     @property
     def action_low(self) -> Tensor:
