@@ -147,9 +147,7 @@ def test_interpolation_agrees_with_scipy():
     state += torch.tensor([-1.0, 0.0, 2.0])
     index, inside, outside = grid.locate(state)
     expected = interpolate.interpn([a.numpy() for a in grid.axes], value.numpy(), state.numpy())
-    torch.testing.assert_close(
-        grid.gather(grid.pad(value), index, inside).double(), torch.as_tensor(expected)
-    )
+    torch.testing.assert_close(grid.gather(grid.pad(value), index, inside).double(), torch.as_tensor(expected))
     assert not outside.any()
 
 

@@ -78,9 +78,7 @@ def test_frames_with_equal_channels_take_two_thirds_until_one_does_not():
     before = grey.get(slice(None))["frames"]
     grey.extend(episode(5, seed=1, size=32))
     assert torch.equal(grey.get(slice(0, 200))["frames"], before)
-    assert torch.equal(
-        grey.get(slice(200, 205))["frames"][:, 2], episode(5, seed=1, size=32)["next", "pixels"][:, 3:]
-    )
+    assert torch.equal(grey.get(slice(200, 205))["frames"][:, 2], episode(5, seed=1, size=32)["next", "pixels"][:, 3:])
 
 
 def test_a_full_store_drops_the_oldest_and_reuses_their_memory():
@@ -193,8 +191,7 @@ def test_saving_is_bit_exact_and_goes_on(tmp_path, grey):
         kept.extend(episode(5, seed=9, grey=grey))
     assert (loaded.get(slice(None)) == store.get(slice(None))).all()
     assert (
-        loaded.sample(9, torch.Generator().manual_seed(0))
-        == store.sample(9, torch.Generator().manual_seed(0))
+        loaded.sample(9, torch.Generator().manual_seed(0)) == store.sample(9, torch.Generator().manual_seed(0))
     ).all()
 
 

@@ -47,9 +47,7 @@ def test_semi_implicit_dynamics_agree_with_gymnasium():
 def test_actions_beyond_the_bound_are_clamped():
     env = PendulumEnv(max_torque=3.0)
     state = torch.zeros(1, 2)
-    assert torch.equal(
-        env.dynamics(state, torch.tensor([[50.0]])), env.dynamics(state, torch.tensor([[3.0]]))
-    )
+    assert torch.equal(env.dynamics(state, torch.tensor([[50.0]])), env.dynamics(state, torch.tensor([[3.0]])))
 
 
 def test_two_frames_determine_the_state_with_the_semi_implicit_integrator():
@@ -80,9 +78,7 @@ def test_rollouts_show_the_true_previous_frame(integrator):
     assert torch.equal(rollout["next", "pixels"][:, :, :3], frames)
     expected = env.wrap(env.dynamics(state, rollout["action"]))
     torch.testing.assert_close(expected, following)
-    assert torch.equal(
-        rollout["pixels"][:, 1:][~done[:, :-1]], rollout["next", "pixels"][:, :-1][~done[:, :-1]]
-    )
+    assert torch.equal(rollout["pixels"][:, 1:][~done[:, :-1]], rollout["next", "pixels"][:, :-1][~done[:, :-1]])
 
 
 def test_observe_gives_the_previous_frame_first():
@@ -146,9 +142,7 @@ def test_a_partial_reset_leaves_the_others_alone():
     env = PendulumEnv(batch_size=[3], seed=0)
     before = env.rollout(2, auto_reset=True, break_when_any_done=False)[:, -1]["next"]
     mask = torch.tensor([[True], [False], [True]])
-    after = env.reset(
-        before.clone().set("_reset", mask).set("done", ~mask & mask).set("terminated", ~mask & mask)
-    )
+    after = env.reset(before.clone().set("_reset", mask).set("done", ~mask & mask).set("terminated", ~mask & mask))
     assert torch.equal(after["state"][1], before["state"][1])
     assert torch.equal(after["pixels"][1], before["pixels"][1])
     assert (after["state"][[0, 2]] != before["state"][[0, 2]]).all()

@@ -63,9 +63,7 @@ def test_frames_agree_with_gymnasium_at_a_thousand_angles():
 def test_the_picture_is_the_right_way_round():
     up, left, down, right = PendulumRenderer(64)(torch.tensor([0.0, math.pi / 2, math.pi, -math.pi / 2]))
     rod = torch.tensor([204, 77, 77], dtype=torch.uint8)
-    for frame, (row, column) in zip(
-        (up, left, down, right), ((20, 32), (32, 20), (44, 32), (32, 44)), strict=True
-    ):
+    for frame, (row, column) in zip((up, left, down, right), ((20, 32), (32, 20), (44, 32), (32, 44)), strict=True):
         assert torch.equal(frame[:, row, column], rod)
         assert (frame[1] < 200).sum() < 80  # nothing but the rod is coloured
         assert (frame[:, 32, 32] < rod).all()  # the axle is darker than the rod

@@ -52,9 +52,7 @@ class Grid:
                 f"{len(low)}, {len(high)}, {len(sizes)}, {len(periods)}."
             )
         if any(n < 2 for n in sizes) or any(h <= l for l, h in zip(low, high, strict=True)):
-            raise ConfigError(
-                f"grid: expected low < high and >= 2 nodes per axis, received {low}, {high}, {sizes}."
-            )
+            raise ConfigError(f"grid: expected low < high and >= 2 nodes per axis, received {low}, {high}, {sizes}.")
         for l, h, p in zip(low, high, periods, strict=True):
             if p and not math.isclose(p, h - l, rel_tol=1e-6):
                 raise ConfigError(f"grid: expected a period equal to high - low = {h - l}, received {p}.")
@@ -109,10 +107,7 @@ class Grid:
         """Multilinear interpolation of padded values at located states, ``(*batch,)``."""
         corners = [padded[index + offset] for offset in self._corner_offsets()]
         for k in reversed(range(self.dim)):  # the last axis varies fastest over the corners
-            corners = [
-                torch.lerp(corners[2 * i], corners[2 * i + 1], inside_cell[k])
-                for i in range(len(corners) // 2)
-            ]
+            corners = [torch.lerp(corners[2 * i], corners[2 * i + 1], inside_cell[k]) for i in range(len(corners) // 2)]
         return corners[0]
 
     def _corner_offsets(self) -> list[int]:
@@ -163,13 +158,9 @@ class ViabilityKernel:
             ShapeError, DTypeError: the states are not a floating-point ``(*batch, d)`` tensor.
         """
         if not state.is_floating_point():
-            raise DTypeError(
-                f"state: expected a floating-point tensor, received {state.dtype}; call .float()."
-            )
+            raise DTypeError(f"state: expected a floating-point tensor, received {state.dtype}; call .float().")
         if state.ndim < 1 or state.shape[-1] != self.grid.dim:
-            raise ShapeError(
-                f"state: expected shape (*batch, {self.grid.dim}), received {tuple(state.shape)}."
-            )
+            raise ShapeError(f"state: expected shape (*batch, {self.grid.dim}), received {tuple(state.shape)}.")
         index, inside_cell, outside = self.grid.locate(state)
         value = self.grid.gather(self.grid.pad(self.value).to(inside_cell.dtype), index, inside_cell)
         beyond = math.inf if self.outside else -math.inf
@@ -397,9 +388,7 @@ class _Problem:
         for action in actions.to(nodes):
             after = dynamics(nodes, action.expand(nodes.shape[0], -1))
             if after.shape != nodes.shape:
-                raise ShapeError(
-                    f"dynamics: expected shape {tuple(nodes.shape)}, received {tuple(after.shape)}."
-                )
+                raise ShapeError(f"dynamics: expected shape {tuple(nodes.shape)}, received {tuple(after.shape)}.")
             if torch.isnan(after).any():
                 raise NonFiniteError("dynamics: expected finite states, received NaN for a node of the grid.")
             successors.append(grid.locate(after))

@@ -141,9 +141,7 @@ def collect_rollouts(
     if n < 1 or (steps is not None and steps < 1):
         raise ConfigError(f"collection: expected n >= 1 and steps >= 1 or None, received {n} and {steps}.")
     if region is not None and not isinstance(env, EnvBase):
-        raise ConfigError(
-            "region: expected with an environment only, received it with a function that makes one."
-        )
+        raise ConfigError("region: expected with an environment only, received it with a function that makes one.")
     if store is None:
         store = TransitionStore(n, keep_state=keep_state)
     if isinstance(env, EnvBase) and seed is not None:

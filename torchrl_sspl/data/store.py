@@ -289,9 +289,7 @@ class TransitionStore(Storage):
         """Restore what ``state_dict`` returned, bit for bit; the capacity must suffice."""
         meta = state_dict["_meta"]
         if meta["len"] > self.max_size:
-            raise CheckpointError(
-                f"store: expected at most {self.max_size} transitions, found {meta['len']}."
-            )
+            raise CheckpointError(f"store: expected at most {self.max_size} transitions, found {meta['len']}.")
         self._empty()
         self.keep_state = meta["keep_state"]
         self._len, self._cursor = meta["len"], meta["cursor"] % self.max_size
@@ -412,9 +410,7 @@ class RegionSampler(Sampler):
 
     def __init__(self, safe: float = 0.125, unsafe: float = 0.125) -> None:
         if safe < 0 or unsafe < 0 or safe + unsafe > 1:
-            raise ConfigError(
-                f"shares: expected safe, unsafe >= 0 with a sum <= 1, received {safe}, {unsafe}."
-            )
+            raise ConfigError(f"shares: expected safe, unsafe >= 0 with a sum <= 1, received {safe}, {unsafe}.")
         self.safe, self.unsafe = safe, unsafe
 
     def sample(self, storage: Storage, batch_size: int) -> tuple[Tensor, dict]:

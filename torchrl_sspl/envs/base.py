@@ -237,18 +237,14 @@ class SafetyEnv(EnvBase):
         else:
             self._generator.manual_seed(seed)
 
-    def _reset(
-        self, tensordict: TensorDictBase | None, *, set_state: bool = False, **_: Any
-    ) -> TensorDictBase:
+    def _reset(self, tensordict: TensorDictBase | None, *, set_state: bool = False, **_: Any) -> TensorDictBase:
         n = self._state.shape[0]
         rows = torch.arange(n, device=self.device)
         if tensordict is not None and "_reset" in tensordict:
             rows = rows[tensordict["_reset"].reshape(n)]
         if set_state:
             if tensordict is None or "state" not in tensordict:
-                raise ConfigError(
-                    "reset(set_state=True): expected key 'state' in the tensordict, found none."
-                )
+                raise ConfigError("reset(set_state=True): expected key 'state' in the tensordict, found none.")
             given = tensordict["state"].to(self.device, torch.float32)
             check_tensor("state", given, self.state_dim)
             state = self.wrap(given.reshape(n, self.state_dim)[rows])

@@ -187,9 +187,7 @@ class PendulumEnv(SafetyEnv):
         before = self.previous_state(state) if previous_state is None else previous_state
         check_tensor("previous_state", before, 2)
         if before.shape != state.shape:
-            raise ShapeError(
-                f"previous_state: expected shape {tuple(state.shape)}, received {tuple(before.shape)}."
-            )
+            raise ShapeError(f"previous_state: expected shape {tuple(state.shape)}, received {tuple(before.shape)}.")
         renderer = _gymnasium_renderer(self.image_size)
         return torch.cat([renderer(before[..., 0]), renderer(state[..., 0])], dim=-3)
 

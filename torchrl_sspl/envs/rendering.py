@@ -57,9 +57,7 @@ class PendulumRenderer:
         [204, 77, 77]
     """
 
-    def __init__(
-        self, image_size: int = 64, *, snap: bool = True, device: torch.device | str | None = None
-    ) -> None:
+    def __init__(self, image_size: int = 64, *, snap: bool = True, device: torch.device | str | None = None) -> None:
         if not isinstance(image_size, int) or image_size < 16:
             raise ConfigError(f"image_size: expected an integer >= 16, received {image_size!r}.")
         self.image_size = image_size
@@ -100,9 +98,7 @@ class PendulumRenderer:
             raise DTypeError(f"angle: expected floating point, received {angle.dtype}; call .float().")
         if not torch.isfinite(angle).all():
             bad = int((~torch.isfinite(angle)).sum())
-            raise NonFiniteError(
-                f"angle: expected finite values, received {bad} of {angle.numel()} NaN or infinite."
-            )
+            raise NonFiniteError(f"angle: expected finite values, received {bad} of {angle.numel()} NaN or infinite.")
         flat = angle.detach().reshape(-1).to(self._x.device)
         size = self.image_size
         frames = torch.full((flat.shape[0], 3, size, size), 255, dtype=torch.uint8, device=self._x.device)
@@ -230,11 +226,7 @@ class GymnasiumRenderer:
         cell = (torch.searchsorted(self._borders, wrapped, right=True) - 1) % self._borders.shape[0]
         for k in cell[~self._known[cell]].unique().tolist():
             last = k + 1 == len(self._borders)
-            width = (
-                self._borders[0] + turn - self._borders[k]
-                if last
-                else self._borders[k + 1] - self._borders[k]
-            )
+            width = self._borders[0] + turn - self._borders[k] if last else self._borders[k + 1] - self._borders[k]
             self._frames[k] = self._draw(float(self._borders[k] + width / 2))
             self._known[k] = True
         size = self.image_size
