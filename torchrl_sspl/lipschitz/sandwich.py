@@ -85,11 +85,21 @@ class SandwichBarrier(nn.Module):
                 f"{latent_dim}, {list(hidden)} and {lipschitz_bound}"
             )
         self.latent_dim, self.lipschitz_bound = latent_dim, float(lipschitz_bound)
-        free = [torch.randn(n_out, n_in + n_out) / math.sqrt(n_in + n_out) for n_in, n_out in itertools.pairwise(sizes)]
-        self.free = nn.ParameterList([nn.Parameter(w) for w in free])
-        self.gain = nn.ParameterList([nn.Parameter(w.norm()) for w in free])
-        self.log_psi = nn.ParameterList([nn.Parameter(torch.zeros(n)) for n in hidden])
-        self.bias = nn.ParameterList([nn.Parameter(torch.zeros(n)) for n in sizes[1:]])
+        shapes = [(n_out, n_in + n_out) for n_in, n_out in itertools.pairwise(sizes)]
+        self.free = nn.ParameterList([nn.Parameter(torch.empty(shape)) for shape in shapes])
+        self.gain = nn.ParameterList([nn.Parameter(torch.empty(())) for _ in shapes])
+        self.log_psi = nn.ParameterList([nn.Parameter(torch.empty(n)) for n in hidden])
+        self.bias = nn.ParameterList([nn.Parameter(torch.empty(n)) for n in sizes[1:]])
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Draws the weights anew, in place."""
+        for free, gain in zip(self.free, self.gain, strict=True):
+            free.normal_(std=1.0 / math.sqrt(free.shape[1]))
+            gain.copy_(free.norm())
+        for zero in (*self.log_psi, *self.bias):
+            zero.zero_()
 
     def weights(self) -> list[Tensor]:
         """Plain weights ``W_0 .. W_l``, each ``(out, in)``, differentiable."""
