@@ -78,6 +78,17 @@ def test_an_environment_function_works(env):
     assert len(store) == 30
 
 
+def _small_environment():
+    return PendulumEnv(batch_size=[4], image_size=16)
+
+
+@pytest.mark.slow
+def test_worker_processes_collect_different_data():
+    store = collect_random(_small_environment, 400, seed=0, backend="process", num_collectors=2, sync=True)
+    assert len(store) == 400
+    assert store.get(slice(None))["action"].unique().numel() > 390
+
+
 def test_bad_arguments_are_named(env):
     with pytest.raises(ConfigError, match="n >= 1"):
         collect_random(env, 0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -43,7 +44,9 @@ class RandomActions(TensorDictModuleBase):
             if self._seed is None:
                 self._generator.seed()
             else:
-                self._generator.manual_seed(self._seed)
+                # Workers of a collector get copies of this policy: each draws actions of its own.
+                worker = sum(multiprocessing.current_process()._identity)  # type: ignore[attr-defined]
+                self._generator.manual_seed(self._seed + 1_000_003 * worker)
         shape = (*tensordict.batch_size, *self._low.shape)
         unit = torch.rand(shape, generator=self._generator, device=self._low.device)
         return tensordict.set("action", self._low + unit * (self._high - self._low))
@@ -173,7 +176,7 @@ def collect_rollouts(
                 if missing == 0:
                     break
         finally:
-            source.shutdown(close_env=False)
+            source.shutdown(close_env=not isinstance(env, EnvBase))  # ours to close only if made here
     return store
 
 
