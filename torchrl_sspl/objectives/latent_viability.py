@@ -174,26 +174,44 @@ def robust_invariant_set(
     return InvariantSet(torch.as_tensor(inside), torch.as_tensor(clearance), iteration)
 
 
-def nearby_residuals(latent: Tensor, reference: Tensor, residual: Tensor, *, count: int) -> Tensor:
-    """Errors of the dynamics that were observed nearest to every latent.
+def nearby_residuals(
+    latent: Tensor, reference: Tensor, residual: Tensor, *, count: int, spread: float, neighbours: int = 64
+) -> tuple[Tensor, Tensor]:
+    r"""Errors of the dynamics near every latent: a sample of them, and the ends of their principal axes.
+
+    .. math:: \{ \mu \} \cup \{ \mu \pm s \sqrt{\lambda_j} v_j \}_{j = 1, 2}
+
+    with mean and leading eigenpairs of the covariance of the residuals of the nearest neighbours. The axes vary
+    smoothly with the latent, which a handful of sampled errors would not: an invariant set that has to tolerate
+    them has a smooth border.
 
     Args:
         latent: ``(n, p)``.
         reference: ``(m, p)`` latents at which errors were observed.
         residual: ``(m, p)`` errors, next latent minus predicted next latent.
-        count: errors per latent.
+        count: sampled errors per latent.
+        spread: s, in standard deviations.
+        neighbours: errors that make the covariance.
 
     Returns:
-        ``(n, count, p)``.
+        ``(n, count, p)`` samples and ``(n, j, p)`` ends of axes, j = 5 (3 if p is 1).
 
     Source: none.
 
     Example:
-        >>> nearby_residuals(torch.tensor([[0.9]]), torch.tensor([[0.0], [1.0]]), torch.tensor([[0.1], [0.2]]), count=1)
-        tensor([[[0.2000]]])
+        >>> z = torch.linspace(0, 1, 100)[:, None]
+        >>> sample, axes = nearby_residuals(z[:2], z, 0.1 * torch.ones(100, 1), count=3, spread=2.0)
+        >>> sample.shape, axes.shape
+        (torch.Size([2, 3, 1]), torch.Size([2, 3, 1]))
     """
-    index = _tree(reference).query(latent.detach().cpu().numpy(), k=count)[1]
-    return residual[torch.as_tensor(index).reshape(len(latent), count)]
+    k = min(neighbours, len(reference))
+    index = torch.as_tensor(_tree(reference).query(latent.detach().cpu().numpy(), k=k)[1]).reshape(len(latent), k)
+    local = residual[index]
+    mean = local.mean(1, keepdim=True)
+    centred = local - mean
+    values, vectors = torch.linalg.eigh(centred.mT @ centred / k)
+    axes = (vectors * values.clamp_min(0.0).sqrt()[:, None]).mT.flip(1)[:, :2] * spread
+    return local[:, :count], torch.cat([mean, mean + axes, mean - axes], dim=1)
 
 
 def barrier_targets(

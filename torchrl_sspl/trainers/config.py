@@ -103,7 +103,8 @@ class SynthesisConfig:
         dynamics_steps: optimiser steps of the refit of the latent dynamics.
         tube_radius: distance from the data up to which a latent off the manifold may belong to the safe set.
         radius: latent distance rho that the invariant set of the data keeps to everything outside.
-        residuals: observed errors of the dynamics that every successor must tolerate.
+        residuals: observed errors of the dynamics per latent that the fine-tuning adds to successors.
+        residual_spread: standard deviations of the local error that the invariant set of the data tolerates.
         actions: actions per dimension tried at every latent.
         fit_steps: steps in which barrier and policy are regressed onto their targets.
         steer_steps: steps of the policy alone on the condition, with the barrier held still.
@@ -113,6 +114,7 @@ class SynthesisConfig:
         batch: latents per step.
         lr: peak learning rate of the fine-tuning.
         unsafe_margin: hinge margin on labelled unsafe latents.
+        deviation_coeff: weight lambda_3 of the deviation from the user's policy (preset "paper").
         recovery_coeff: weight of the action that leads back, on latents outside the set.
         check_episodes: held-out episodes of a round's check.
         check_horizon: steps of each.
@@ -124,17 +126,19 @@ class SynthesisConfig:
     exploration: float = 0.15
     dynamics_steps: int = 6000
     tube_radius: float = 0.3
-    radius: float = 0.015
-    residuals: int = 8
+    radius: float = 0.01
+    residuals: int = 16
+    residual_spread: float = 2.5
     actions: int = 21
-    fit_steps: int = 3000
+    fit_steps: int = 4000
     steer_steps: int = 1000
     tune_steps: int = 2000
-    margin: float = 0.015
+    margin: float = 0.01
     band: float = 0.1
     batch: int = 1024
     lr: float = 1e-3
     unsafe_margin: float = 0.03
+    deviation_coeff: float = 0.01
     recovery_coeff: float = 0.3
     check_episodes: int = 1500
     check_horizon: int = 40
@@ -262,6 +266,8 @@ def _apply_preset(config: TrainingConfig) -> None:
         rep = config.representation
         rep.consistency_target, rep.inverse_coeff, rep.saturation_coeff = "target", 0.0, 0.0
         rep.safety_margin, rep.consistency_coeff, rep.lr = 0.05, 1.0, 1e-3
+        rep.label_coeff, rep.variance_coeff = 1.0, 0.0
+        config.synthesis.rounds, config.synthesis.tune_steps, config.synthesis.rollout_transitions = 6, 300, 6000
     if config.preset == "smoke":
         config.data = DataConfig(transitions=600, safe=150, unsafe=200)
         config.representation.steps, config.representation.batch = 30, 48

@@ -387,7 +387,7 @@ class SafePolicyTraining:
         s = self.config.synthesis
         table, _ = self._targets(number)
         loss = TargetLoss(
-            self.barrier, self.policy, action_scale=self.env.max_action, worst_coeff=0.3, worst_fraction=0.05
+            self.barrier, self.policy, action_scale=self.env.max_action, scale=0.1, worst_coeff=0.3, worst_fraction=0.05
         )
         first = number == 0
         self._loop(
@@ -506,7 +506,8 @@ class SafePolicyTraining:
         if check.passed and (self.best is None or check.size >= self.best["size"]):
             state = {k: v.clone() for k, v in agent.state_dict().items()}
             state[f"barrier.{len(agent.barrier) - 1}.bias"] -= check.level  # type: ignore[arg-type]
-            self.best = {"size": check.size, "round": number, "agent": state}
+            witness = [m.tolist() for m in self.barrier.multipliers()]
+            self.best = {"size": check.size, "round": number, "agent": state, "multipliers": witness}
 
     # ------------------------------------------------------------------ targets
 
@@ -543,8 +544,10 @@ class SafePolicyTraining:
         with torch.no_grad():
             residual = data["next_latent"] - self.dynamics(z, data["action"])
         sample = torch.randperm(len(z), generator=g)[:30000]
-        near = nearby_residuals(zc, z[sample], residual[sample], count=s.residuals)
-        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], radius=s.radius, residuals=near)
+        near, axes = nearby_residuals(
+            zc, z[sample], residual[sample], count=s.residuals, spread=s.residual_spread
+        )
+        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], radius=s.radius, residuals=axes)
         if not bool(found.inside.any()):
             raise ConfigError(
                 f"expected a robust invariant set of the data at synthesis.radius={s.radius}, found none in {len(zc)} "
@@ -613,7 +616,7 @@ class SafePolicyTraining:
         return self.make_env([256], 0)
 
     def _encoded(self, n: int, seed: int, region=None) -> dict[str, Tensor]:
-        steps = 1 if region is not None else self.config.data.episode_steps
+        steps = self.config.data.episode_steps
         store = collect_random(self._env_for(), n, seed=seed, steps=steps, region=region)
         return self._encode_store(store)
 
@@ -667,16 +670,18 @@ class SafePolicyTraining:
 
     def _result(self) -> TrainingResult:
         agent = self._agent(0.0)
+        witness = [m.tolist() for m in self.barrier.multipliers()]
         if self.best is not None:
             agent.load_state_dict(self.best["agent"])
+            witness = self.best["multipliers"]
             reason = f"round {self.best['round']} has the largest set that passed the held-out checks"
         else:
             reason = "no round passed the held-out checks: " + "; ".join(
                 f"round {c.round}: {c.reason}" for c in self.checks
             )
-        weights = [(layer.weight, layer.bias) for layer in agent.barrier if isinstance(layer, nn.Linear)]  # type: ignore[union-attr]
-        proof = prove_lipschitz([w for w, _ in weights], self.config.network.lipschitz_bound)
-        agent.description["lipschitz_proved"] = proof.proved
+        bound = self.config.network.lipschitz_bound
+        proof = prove_lipschitz(agent.barrier, bound, multipliers=[torch.tensor(m) for m in witness])
+        agent.description["lipschitz"] = {"proved": proof.proved, "reason": proof.reason, "multipliers": witness}
         agent.description["stop_reason"] = reason
         agent.save(self.out_dir / "agent")
         return TrainingResult(agent, self.checks, reason, self.seconds)

@@ -1,0 +1,152 @@
+r"""The paper's barrier: a plain network that a log-determinant keeps inside the cone of its Lipschitz certificate."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sspl.errors import ConfigError, NotPositiveDefiniteError, ShapeError
+from torchrl_sspl.functional import lmi_loss, lmi_matrix
+
+ACTIVATIONS: dict[str, tuple[Callable[[], nn.Module], tuple[float, float]]] = {
+    "relu": (nn.ReLU, (0.0, 1.0)),
+    "leaky_relu": (lambda: nn.LeakyReLU(0.1), (0.1, 1.0)),
+    "tanh": (nn.Tanh, (0.0, 1.0)),
+    "softplus": (nn.Softplus, (0.0, 1.0)),
+    "sigmoid": (nn.Sigmoid, (0.0, 0.25)),
+}
+
+
+class LMIBarrier(nn.Module):
+    r"""Network with trainable multipliers whose matrix :math:`M(\theta, \Lambda)` stays positive definite.
+
+    It starts feasible: the weights are scaled so that :math:`\rho = \prod_k \|W_k\| \beta^l / L < 1`, and the
+    multipliers are :math:`\Lambda_{k+1} = a_{k+1} I` with :math:`a_0 = L^2`,
+    :math:`a_{k+1} = a_k \rho^{2/(l+1)} / (\beta \|W_k\|)^2`. Steps are taken through :meth:`backtracking_step`, which
+    never leaves the cone, so that the bound holds at every moment of the training.
+
+    Args:
+        latent_dim: size p of the latent.
+        hidden: widths of the hidden layers, at least one.
+        lipschitz_bound: L.
+        activation: one of ``ACTIVATIONS``.
+        start_ratio: :math:`\rho` at the start.
+
+    Raises:
+        ConfigError: if a size, the bound, the ratio or the activation is not valid.
+
+    Source: paper Lemma 2 and eq. (9) (Pauli et al. 2021); deviation: the cone is never left.
+
+    Example:
+        >>> _ = torch.manual_seed(0)
+        >>> barrier = LMIBarrier(2, (8, 8), lipschitz_bound=2.0)
+        >>> bool(torch.linalg.eigvalsh(barrier.matrix())[0] > 0), barrier(torch.zeros(5, 2)).shape
+        (True, torch.Size([5, 1]))
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        hidden: Sequence[int] = (64, 64, 64),
+        lipschitz_bound: float = 2.0,
+        *,
+        activation: str = "relu",
+        start_ratio: float = 0.5,
+    ) -> None:
+        super().__init__()
+        if activation not in ACTIVATIONS:
+            raise ConfigError(f"expected activation to be one of {sorted(ACTIVATIONS)}, received {activation!r}")
+        sizes = [latent_dim, *hidden, 1]
+        if len(sizes) < 3 or min(sizes) < 1 or not lipschitz_bound > 0 or not 0 < start_ratio < 1:
+            raise ConfigError(
+                f"expected sizes >= 1 with a hidden layer, lipschitz_bound > 0 and 0 < start_ratio < 1, received "
+                f"{sizes}, {lipschitz_bound} and {start_ratio}"
+            )
+        make, self.slope = ACTIVATIONS[activation]
+        self.latent_dim, self.lipschitz_bound = latent_dim, float(lipschitz_bound)
+        layers: list[nn.Module] = []
+        for n_in, n_out in itertools.pairwise(sizes):
+            layers += [nn.Linear(n_in, n_out), make()]
+        self.net = nn.Sequential(*layers[:-1])
+        beta, count = self.slope[1], len(sizes) - 1
+        with torch.no_grad():
+            product = beta ** (count - 1) * math.prod(float(torch.linalg.matrix_norm(w, 2)) for w in self.weights())
+            factor = (start_ratio * lipschitz_bound / product) ** (1.0 / count)
+            for weight in self.weights():
+                weight.mul_(factor)
+            level, logs = lipschitz_bound**2, []
+            for weight in self.weights()[:-1]:
+                level *= start_ratio ** (2.0 / count) / (beta * float(torch.linalg.matrix_norm(weight, 2))) ** 2
+                logs.append(nn.Parameter(torch.full((len(weight),), math.log(level))))
+        self.log_multipliers = nn.ParameterList(logs)
+
+    def weights(self) -> list[Tensor]:
+        """Weights ``W_0 .. W_l``, each ``(out, in)``."""
+        return [m.weight for m in self.net if isinstance(m, nn.Linear)]
+
+    def multipliers(self) -> list[Tensor]:
+        r"""Diagonals of :math:`\Lambda`, one vector per hidden layer."""
+        return [p.exp() for p in self.log_multipliers]
+
+    def matrix(self) -> Tensor:
+        r"""The matrix :math:`M(\theta, \Lambda)`, float64."""
+        return lmi_matrix(
+            [w.double() for w in self.weights()], [m.double() for m in self.multipliers()], self.lipschitz_bound, self.slope
+        )
+
+    def forward(self, latent: Tensor) -> Tensor:
+        """Barrier value ``(*batch, p) -> (*batch, 1)``."""
+        if latent.shape[-1] != self.latent_dim:
+            raise ShapeError(f"expected latents of shape (*batch, {self.latent_dim}), received {tuple(latent.shape)}")
+        return self.net(latent)
+
+    @torch.no_grad()
+    def collapse(self) -> nn.Sequential:
+        """A copy as a plain network."""
+        import copy
+
+        return copy.deepcopy(self.net)
+
+    @torch.no_grad()
+    def feasible(self) -> bool:
+        """Whether the matrix is positive definite."""
+        return not int(torch.linalg.cholesky_ex(self.matrix()).info)
+
+    @torch.no_grad()
+    def backtracking_step(self, before: dict[str, Tensor], *, shrink: float = 0.5, attempts: int = 20) -> float:
+        """Pulls the parameters back towards where they came from until they are inside the cone.
+
+        Args:
+            before: ``state_dict`` (cloned) from before the optimiser's step; it must be feasible.
+            shrink: factor on the step at every attempt.
+            attempts: number of attempts, after which the old parameters are restored.
+
+        Returns:
+            The share of the step that was kept, 1 if it was feasible, 0 if none of it.
+
+        Raises:
+            NotPositiveDefiniteError: if the old parameters are not feasible either.
+
+        Source: none; the printed loss has no such safeguard.
+        """
+        if self.feasible():
+            return 1.0
+        after = {k: v.clone() for k, v in self.state_dict().items()}
+        share = 1.0
+        for _ in range(attempts):
+            share *= shrink
+            self.load_state_dict({k: torch.lerp(before[k], after[k], share) for k in after})
+            if self.feasible():
+                return share
+        self.load_state_dict(before)
+        if not self.feasible():
+            raise NotPositiveDefiniteError("expected feasible parameters before the step, received infeasible ones; start from a feasible point")
+        return 0.0
+
+    def loss(self) -> Tensor:
+        r"""The paper's :math:`L_M = -\log\det M`; raises ``NotPositiveDefiniteError`` outside the cone."""
+        return lmi_loss(self.matrix())
