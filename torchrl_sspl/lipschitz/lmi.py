@@ -72,17 +72,30 @@ class LMIBarrier(nn.Module):
         for n_in, n_out in itertools.pairwise(sizes):
             layers += [nn.Linear(n_in, n_out), make()]
         self.net = nn.Sequential(*layers[:-1])
-        beta, count = self.slope[1], len(sizes) - 1
-        with torch.no_grad():
-            product = beta ** (count - 1) * math.prod(float(torch.linalg.matrix_norm(w, 2)) for w in self.weights())
-            factor = (start_ratio * lipschitz_bound / product) ** (1.0 / count)
-            for weight in self.weights():
-                weight.mul_(factor)
-            level, logs = lipschitz_bound**2, []
-            for weight in self.weights()[:-1]:
-                level *= start_ratio ** (2.0 / count) / (beta * float(torch.linalg.matrix_norm(weight, 2))) ** 2
-                logs.append(nn.Parameter(torch.full((len(weight),), math.log(level))))
-        self.log_multipliers = nn.ParameterList(logs)
+        self.log_multipliers = nn.ParameterList([nn.Parameter(torch.empty(n)) for n in hidden])
+        self.start_ratio = float(start_ratio)
+        self._start()
+
+    @torch.no_grad()
+    def _start(self) -> None:
+        """Scales the weights and sets the multipliers so that the matrix is positive definite."""
+        weights, beta = self.weights(), self.slope[1]
+        count = len(weights)
+        product = beta ** (count - 1) * math.prod(float(torch.linalg.matrix_norm(w, 2)) for w in weights)
+        factor = (self.start_ratio * self.lipschitz_bound / product) ** (1.0 / count)
+        level = self.lipschitz_bound**2
+        for weight in weights:
+            weight.mul_(factor)
+        for weight, logs in zip(weights[:-1], self.log_multipliers, strict=True):
+            level *= self.start_ratio ** (2.0 / count) / (beta * float(torch.linalg.matrix_norm(weight, 2))) ** 2
+            logs.fill_(math.log(level))
+
+    def reset_parameters(self) -> None:
+        """Draws the weights anew, in place, inside the cone."""
+        for module in self.net:
+            if isinstance(module, nn.Linear):
+                module.reset_parameters()
+        self._start()
 
     def weights(self) -> list[Tensor]:
         """Weights ``W_0 .. W_l``, each ``(out, in)``."""
