@@ -1,0 +1,127 @@
+"""Training: it resumes exactly, refuses what does not belong to it, and keeps only what passed."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.trainers.config import make_config
+from torchrl_sspl.trainers.evaluation import evaluate
+from torchrl_sspl.trainers.pipeline import CHECKPOINT_FILE, Check, SafePolicyTraining
+
+TINY = [
+    "preset=smoke", "progress=false", "checkpoint_seconds=0",
+    "data.transitions=64", "data.safe=16", "data.unsafe=16", "representation.steps=3", "representation.batch=24",
+    "synthesis.rounds=2", "synthesis.transitions=240", "synthesis.rollout_transitions=24",
+    "synthesis.dynamics_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=3", "synthesis.tune_steps=3",
+    "synthesis.check_episodes=8", "synthesis.check_horizon=2", "synthesis.batch=32", "synthesis.residuals=2",
+    "network.barrier_hidden=[8,8]", "network.dynamics_hidden=[8]", "network.policy_hidden=[8]",
+]
+
+
+def make_env(batch_size: list[int], seed: int) -> PendulumEnv:
+    return PendulumEnv(batch_size=batch_size, seed=seed)
+
+
+def training(path, *overrides: str, kind=SafePolicyTraining) -> SafePolicyTraining:
+    return kind(make_config([*TINY, *overrides, f"out_dir={path}"]), make_env)
+
+
+class Killed(Exception):
+    pass
+
+
+class Interrupted(SafePolicyTraining):
+    """Dies right after its n-th checkpoint, as a killed process would."""
+
+    after = 0
+
+    def _checkpoint(self) -> None:
+        super()._checkpoint()
+        type(self).after -= 1
+        if type(self).after == 0:
+            raise Killed
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    path = tmp_path_factory.mktemp("whole")
+    return path, training(path).run()
+
+
+@pytest.mark.parametrize("checkpoints", [1, 2, 4, 9, 13, 17])
+def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkpoints):
+    Interrupted.after = checkpoints
+    with pytest.raises(Killed):
+        training(tmp_path, kind=Interrupted).run()
+    resumed = training(tmp_path).run()
+    expected = uninterrupted[1].agent.state_dict()
+    for name, value in resumed.agent.state_dict().items():
+        assert torch.equal(value, expected[name]), name
+    assert resumed.checks == uninterrupted[1].checks
+
+
+def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
+    other = training(tmp_path, "seed=1").run().agent.state_dict()
+    assert any(not torch.equal(v, other[k]) for k, v in uninterrupted[1].agent.state_dict().items())
+
+
+def test_a_checkpoint_of_another_configuration_is_refused(uninterrupted):
+    with pytest.raises(ConfigError, match="another out_dir"):
+        training(uninterrupted[0], "synthesis.margin=0.5")
+
+
+def test_an_unreadable_checkpoint_is_named(tmp_path):
+    (tmp_path / CHECKPOINT_FILE).write_bytes(b"not a checkpoint")
+    with pytest.raises(CheckpointError, match=r"checkpoint\.pt"):
+        training(tmp_path)
+
+
+def test_the_written_agent_is_the_returned_one(uninterrupted):
+    path, result = uninterrupted
+    loaded = Agent.load(path / "agent")
+    pixels = make_env([4], 3).observe(torch.zeros(4, 2))
+    assert torch.equal(loaded.encode(pixels), result.agent.encode(pixels))
+    assert torch.equal(loaded.barrier(loaded.encode(pixels)), result.agent.barrier(result.agent.encode(pixels)))
+    assert loaded.description["lipschitz"]["proved"] is True
+
+
+def test_every_line_of_the_log_names_its_phase(uninterrupted):
+    rows = [json.loads(line) for line in (uninterrupted[0] / "log.jsonl").read_text().splitlines()]
+    assert {"represent", "dynamics", "fit", "steer", "tune", "check"} <= {row["phase"] for row in rows}
+
+
+def check(number: int, size: float, passed: bool) -> Check:
+    return Check(number, 0.0, 0, 0, 0, 0, 1.0, size, passed, "" if passed else "left 1")
+
+
+def test_growth_is_never_paid_for_with_invariance(tmp_path):
+    run = training(tmp_path)
+    agent = run._agent(0.0)
+    run._record(0, agent, check(0, 0.4, True))
+    run._record(1, agent, check(1, 0.9, False))
+    assert run.best is not None
+    assert run.best["round"] == 0
+    run._record(2, agent, check(2, 0.5, True))
+    assert run.best["round"] == 2
+
+
+def test_the_level_moves_the_last_bias(tmp_path):
+    run = training(tmp_path)
+    latent = torch.rand(5, 3) * 2 - 1
+    torch.testing.assert_close(run._agent(0.25).barrier(latent), run._agent(0.0).barrier(latent) - 0.25)
+
+
+def test_evaluation_measures_an_untrained_agent_without_flattering_it(uninterrupted):
+    config = make_config(["evaluation.grid=15", "evaluation.kernel_grid=61", "evaluation.rollouts=10", "evaluation.horizon=4"])
+    found = evaluate(uninterrupted[1].agent, make_env([1], 0), config.evaluation)
+    names = {"unsafe_called_safe", "volume_over_kernel", "false_safe", "unsafe_rollouts_return", "lipschitz_ratio"}
+    assert names <= set(found.measurements)
+    for measurement in found.measurements.values():
+        if measurement.unit == "share" and measurement.n:
+            assert 0.0 <= measurement.lower <= measurement.value <= measurement.upper <= 1.0
