@@ -11,12 +11,11 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.objectives import LossModule
 
-from torchrl_sspl.lipschitz import SandwichBarrier
+from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.objectives import PolicyDeviationLoss, SaLaDLoss, SSPLLoss, SynthesisLoss
+from torchrl_sspl.objectives import LipschitzLoss, PolicyDeviationLoss, SaLaDLoss, SSPLLoss, SynthesisLoss
 
 ROWS = 12
-MODEL = {"encoder", "dynamics", "barrier"}
 
 
 def _mlp(inputs: int, outputs: int, *last: nn.Module) -> nn.Sequential:
@@ -70,6 +69,8 @@ class Case:
         count: how many of the networks the loss takes.
         options: keyword arguments of the loss.
         pointwise: no term depends on which other rows are in the batch.
+        rows: the terms belong to rows of the batch.
+        unreached: ends of the names of parameters that the loss does not depend on.
     """
 
     name: str
@@ -79,10 +80,13 @@ class Case:
     count: int = 4
     options: dict[str, Any] = field(default_factory=dict)
     pointwise: bool = True
+    rows: bool = True
+    unreached: tuple[str, ...] = ()
 
     def nets(self) -> tuple[nn.Module | None, ...]:
         encoder, dynamics, barrier, policy = networks(self.source)
         return {
+            1: (LMIBarrier(2, (6,)),),
             2: (encoder, policy),
             3: (encoder, dynamics, barrier),
             4: (encoder, dynamics, barrier, policy),
@@ -162,6 +166,15 @@ CASES = [
         {"loss_policy_deviation": {"encoder", "actor_network"}},
         2,
         {"user_policy": "data", "detach": ()},
+    ),
+    Case(
+        "lipschitz",
+        LipschitzLoss,
+        "latent",
+        {"loss_lipschitz": {"barrier"}},
+        1,
+        rows=False,
+        unreached=("bias",),
     ),
     Case(
         "sspl-paper",

@@ -10,9 +10,11 @@ from torchrl_sspl.lipschitz.exact import (
     prove_lipschitz,
     solve_multipliers,
 )
+from torchrl_sspl.lipschitz.lmi import LMIBarrier
 from torchrl_sspl.lipschitz.sandwich import SandwichBarrier, cayley
 
 __all__ = [
+    "LMIBarrier",
     "LipschitzProof",
     "SandwichBarrier",
     "cayley",

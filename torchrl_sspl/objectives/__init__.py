@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
 from torchrl_sspl.objectives.deviation import PolicyDeviationLoss
+from torchrl_sspl.objectives.lipschitz import LipschitzLoss
 from torchrl_sspl.objectives.salad import SaLaDLoss
 from torchrl_sspl.objectives.sspl import PRESETS, SSPLLoss
 from torchrl_sspl.objectives.synthesis import SynthesisLoss
@@ -12,6 +13,7 @@ __all__ = [
     "PRESETS",
     "LatentBatch",
     "LatentLoss",
+    "LipschitzLoss",
     "PolicyDeviationLoss",
     "SSPLLoss",
     "SaLaDLoss",
