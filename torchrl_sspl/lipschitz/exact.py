@@ -19,7 +19,6 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
-from torchrl_sspl.functional import lmi_matrix
 
 _FACTOR_BITS = 44  # bits after the point of the factor F; its rounding is far below the slack of R
 _MULTIPLIER_BITS = 24
@@ -212,11 +211,6 @@ def _exact_lmi(
     return matrix, shift
 
 
-def _lmi(weights: list[Tensor], logs: Tensor, square: Tensor | float, alpha: float, beta: float) -> Tensor:
-    sizes = [w.shape[0] for w in weights[:-1]]
-    return lmi_matrix(weights, list(logs.exp().split(sizes)), torch.as_tensor(square).sqrt(), (alpha, beta))
-
-
 def _feasible_start(weights: list[Tensor], beta: float) -> tuple[Tensor, float]:
     """Multipliers and a bound (1.05 times the product of norms) at which the matrix is positive definite."""
     norms = [max(float(torch.linalg.matrix_norm(w, 2)), 1e-12) for w in weights]
@@ -226,43 +220,84 @@ def _feasible_start(weights: list[Tensor], beta: float) -> tuple[Tensor, float]:
     level, parts = bound**2, []
     for w, norm in zip(weights[:-1], norms[:-1], strict=True):
         level = level * ratio / norm**2 / beta**2
-        parts.append(torch.full((w.shape[0],), math.log(level), dtype=torch.float64))
+        parts.append(torch.full((w.shape[0],), level, dtype=torch.float64))
     return torch.cat(parts), bound
 
 
 def _minimise_bound(
-    weights: list[Tensor], alpha: float, beta: float, stages: int = 10, target: float | None = None
+    weights: list[Tensor], alpha: float, beta: float, target: float = 0.0, accuracy: float = 1e-7
 ) -> tuple[Tensor, float]:
-    """Interior-point descent on L^2 over the multipliers; every iterate is feasible."""
-    logs, bound = _feasible_start(weights, beta)
-    best = (logs.clone(), bound)
-    for stage in range(stages):
-        weight = 10.0 ** (stage * 0.6)
-        variables = torch.cat([logs, torch.tensor([2 * math.log(bound)], dtype=torch.float64)]).requires_grad_()
-        descent = torch.optim.LBFGS([variables], max_iter=60, history_size=20, line_search_fn="strong_wolfe")
+    r"""Newton's method on the barrier of the cone, :math:`t L^2 - \log\det M - \sum \log \lambda`, for growing t.
 
-        def objective(variables: Tensor = variables, weight: float = weight) -> Tensor:
-            descent.zero_grad()
-            matrix = _lmi(weights, variables[:-1], variables[-1].exp(), alpha, beta)
-            factor, info = torch.linalg.cholesky_ex(matrix)
+    M is linear in the multipliers and in L^2, every multiplier entering with rank two, so that the Hessian is a
+    product of small matrices. Steps are shortened until they stay inside the cone: every iterate is feasible.
+    """
+    sizes = [weights[0].shape[1], *(w.shape[0] for w in weights)]
+    total, inputs, hidden = sum(sizes), sizes[0], sum(sizes[1:-1])
+    # M = constant + L^2 I at the input + sum_i lambda_i U_i K U_i^T, U_i = [row i of the weights, unit vector i].
+    before = torch.block_diag(*weights[:-1], weights[0].new_zeros(0, sizes[-2] + sizes[-1]))
+    pairs = torch.stack([before, torch.eye(total, dtype=torch.float64)[inputs : inputs + hidden]], 1)
+    kernel = torch.tensor([[2 * alpha * beta, -(alpha + beta)], [-(alpha + beta), 2.0]], dtype=torch.float64)
+    constant = torch.zeros(total, total, dtype=torch.float64)
+    constant[-sizes[-1] :, -sizes[-1] - sizes[-2] : -sizes[-1]] = -weights[-1]
+    constant = constant + constant.mT
+    constant[-sizes[-1] :, -sizes[-1] :] = torch.eye(sizes[-1], dtype=torch.float64)
+    first = torch.zeros(total, dtype=torch.float64)
+    first[:inputs] = 1.0
+
+    lams, bound = _feasible_start(weights, beta)
+    # Unknowns relative to the start; a small cost keeps the multiplier of a unit without input from growing for ever.
+    scale = torch.cat([lams, torch.tensor([bound**2], dtype=torch.float64)])
+    cost = torch.cat([torch.full_like(lams, 1e-3), torch.zeros(1, dtype=torch.float64)])
+    x = torch.ones_like(scale)
+
+    def factor_at(point: Tensor) -> Tensor | None:
+        weighted = pairs * (point[:-1] * scale[:-1])[:, None, None]
+        matrix = constant + torch.diag(first * point[-1] * scale[-1])
+        matrix = matrix + torch.einsum("iak,ab,ibl->kl", weighted, kernel, pairs)
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        return None if int(info) or not bool((point > 0).all()) else factor
+
+    def value_at(point: Tensor, factor: Tensor) -> float:
+        return float(cost @ point - 2.0 * factor.diagonal().log().sum() - point[:-1].log().sum())
+
+    factor = factor_at(x)
+    if factor is None:
+        return lams, math.inf
+    weight, limit = float(total), 2.0 * (total + hidden) / accuracy
+    while weight < limit and math.sqrt(float(x[-1]) * scale[-1]) >= target:
+        cost[-1] = weight
+        for _ in range(50):
+            inverse = torch.cholesky_inverse(factor)
+            seen = torch.einsum("iak,kl,jbl->iajb", pairs, inverse, pairs)  # (hidden, 2, hidden, 2)
+            own = torch.einsum("iaib->iab", seen)
+            gradient, hessian = cost.clone(), torch.empty(hidden + 1, hidden + 1, dtype=torch.float64)
+            gradient[:-1] -= (own * kernel).sum((1, 2)) * scale[:-1] + 1.0 / x[:-1]
+            gradient[-1] -= inverse.diagonal()[:inputs].sum() * scale[-1]
+            across = torch.einsum("ab,ibjc->iajc", kernel, seen)
+            hessian[:-1, :-1] = torch.einsum("iajb,jbia->ij", across, across)
+            left = torch.einsum("iak,kl->ial", pairs, inverse[:, :inputs])
+            hessian[:-1, -1] = hessian[-1, :-1] = torch.einsum("ial,ab,ibl->i", left, kernel, left)
+            hessian[-1, -1] = inverse[:inputs, :inputs].square().sum()
+            hessian = hessian * scale[:, None] * scale + torch.diag(torch.cat([x[:-1] ** -2, x.new_zeros(1)]))
+            root, info = torch.linalg.cholesky_ex(hessian)
             if int(info):
-                # Outside the cone: a wall that the line search steps back from.
-                value = 1e12 + 0.0 * variables.sum()
+                break
+            step = -torch.cholesky_solve(gradient[:, None], root)[:, 0]
+            decrement = float(-(gradient @ step))
+            if not decrement > 1e-2:
+                break
+            size, value = 1.0, value_at(x, factor)
+            while size > 1e-8:
+                trial = factor_at(x + size * step)
+                if trial is not None and value_at(x + size * step, trial) < value - 0.1 * size * decrement:
+                    x, factor = x + size * step, trial
+                    break
+                size *= 0.5
             else:
-                value = weight * variables[-1] - 2.0 * factor.diagonal().log().sum() / len(matrix)
-            value.backward()
-            return value
-
-        descent.step(objective)
-        found = variables.detach()
-        if not found.isfinite().all() or int(torch.linalg.cholesky_ex(_lmi(weights, found[:-1], found[-1].exp(), alpha, beta)).info):
-            break
-        logs, bound = found[:-1].clone(), float(found[-1].exp().sqrt())
-        if bound < best[1]:
-            best = (logs.clone(), bound)
-        if target is not None and bound < target:
-            break
-    return best
+                break  # as accurate as float64 allows
+        weight *= 8.0
+    return x[:-1] * scale[:-1], math.sqrt(float(x[-1] * scale[-1]))
 
 
 def solve_multipliers(
@@ -270,7 +305,7 @@ def solve_multipliers(
 ) -> list[Tensor] | None:
     """Multipliers with which the matrix of a claimed bound is positive definite, or None.
 
-    A sandwich barrier brings its own; for other networks an interior-point descent on the bound looks for them.
+    A sandwich barrier brings its own; for other networks an interior-point method looks for them.
 
     Args:
         network: plain network or its weights.
@@ -294,14 +329,12 @@ def solve_multipliers(
     weights = [w.double() for w in layer_weights(network)]
     if len(weights) == 1:
         return []
-    logs, bound = _minimise_bound(weights, alpha, beta, target=lipschitz_bound * (1 - 1e-9))
-    if bound > lipschitz_bound:
-        return None
-    return [part.exp() for part in logs.split([w.shape[0] for w in weights[:-1]])]
+    lams, bound = _minimise_bound(weights, alpha, beta, target=lipschitz_bound * (1 - 1e-9))
+    return None if bound > lipschitz_bound else list(lams.split([w.shape[0] for w in weights[:-1]]))
 
 
 def lipschitz_upper(network: nn.Module | Sequence[Tensor], slope: tuple[float, float] = (0.0, 1.0)) -> float:
-    """Smallest Lipschitz bound that can be proved for a network (within the accuracy of a descent).
+    """Smallest Lipschitz bound that can be proved for a network (within the accuracy of an interior-point method).
 
     Args:
         network: plain network or its weights.
@@ -319,8 +352,8 @@ def lipschitz_upper(network: nn.Module | Sequence[Tensor], slope: tuple[float, f
     weights = [w.double() for w in layer_weights(network)]
     if len(weights) == 1:
         return float(torch.linalg.matrix_norm(weights[0], 2)) * (1 + 1e-9)
-    logs, bound = _minimise_bound(weights, *slope)
-    lams = [part.exp() for part in logs.split([w.shape[0] for w in weights[:-1]])]
+    found, bound = _minimise_bound(weights, *slope)
+    lams = list(found.split([w.shape[0] for w in weights[:-1]]))
     while not prove_lipschitz(weights, bound, slope, multipliers=lams).proved:
         bound *= 1 + 1e-4
     return bound
