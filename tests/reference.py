@@ -1,0 +1,69 @@
+"""The equations once more, in NumPy, slowly and row by row; nothing here imports the package."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+
+def safe_hinge(barrier, margin):
+    return np.array([[max(0.0, b + margin)] for b in barrier[:, 0]]).reshape(-1, 1)
+
+
+def unsafe_hinge(barrier, margin):
+    return np.array([[max(0.0, -b + margin)] for b in barrier[:, 0]]).reshape(-1, 1)
+
+
+def squared_distance(first, second):
+    return np.array([[sum((a - b) ** 2 for a, b in zip(x, y, strict=True))] for x, y in zip(first, second, strict=True)])
+
+
+def distance(first, second):
+    return np.sqrt(squared_distance(first, second))
+
+
+def synthesis_violation(barrier, after, mode, psi, m, decay, decrement, floor, band):
+    rows = []
+    for b, n in zip(barrier[:, 0], after[:, 0], strict=True):
+        if mode == "paper":
+            rows.append(n + m - b + psi)
+        elif mode == "R1":
+            rows.append(n + m - (1 - decay) * b)
+        elif mode == "R2":
+            rows.append(n + m - max(b - decrement, -floor))
+        else:
+            rows.append(max(0.0, n + m) * max(0.0, band - b) / band)
+    return np.array(rows).reshape(-1, 1)
+
+
+def lmi_matrix(weights, multipliers, bound, slope):
+    """Stacks A and C and multiplies, as the lemma is printed (with the selection [0 I 0])."""
+    alpha, beta = slope
+    sizes = [weights[0].shape[1]] + [w.shape[0] for w in weights]
+    edges = np.cumsum([0, *sizes])
+    n_hidden, total = sum(sizes[1:-1]), edges[-1]
+    a = np.zeros((n_hidden, total))
+    row = 0
+    for k, w in enumerate(weights[:-1]):
+        a[row : row + w.shape[0], edges[k] : edges[k + 1]] = w
+        row += w.shape[0]
+    c = np.zeros((n_hidden, total))
+    c[:, sizes[0] : sizes[0] + n_hidden] = np.eye(n_hidden)
+    lam = np.diag(np.concatenate(multipliers))
+    middle = np.block([[2 * alpha * beta * lam, -(alpha + beta) * lam], [-(alpha + beta) * lam, 2 * lam]])
+    stacked = np.vstack([a, c])
+    matrix = stacked.T @ middle @ stacked
+    matrix[: sizes[0], : sizes[0]] += bound**2 * np.eye(sizes[0])
+    matrix[edges[-2] :, edges[-2] :] += np.eye(sizes[-1])
+    matrix[edges[-2] :, edges[-3] : edges[-2]] -= weights[-1]
+    matrix[edges[-3] : edges[-2], edges[-2] :] -= weights[-1].T
+    return matrix
+
+
+def minus_log_det(matrix):
+    return -sum(math.log(v) for v in np.linalg.eigvalsh(matrix))
+
+
+def covering_radius(points, samples):
+    return max(min(math.dist(z, s) for s in samples) for z in points)
