@@ -1,0 +1,20 @@
+"""Figures, films and reports of a run; needs the extra ``viz`` (matplotlib, imageio-ffmpeg) when used, not when imported."""
+
+from torchrl_sspl.viz.animation import animate
+from torchrl_sspl.viz.figures import frames, latent_space, read_log, state_plane, training_curves, trajectories
+from torchrl_sspl.viz.plane import Plane
+from torchrl_sspl.viz.report import format_value, requirement_rows, write_report
+
+__all__ = [
+    "Plane",
+    "animate",
+    "format_value",
+    "frames",
+    "latent_space",
+    "read_log",
+    "requirement_rows",
+    "state_plane",
+    "training_curves",
+    "trajectories",
+    "write_report",
+]

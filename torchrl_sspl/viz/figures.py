@@ -1,0 +1,556 @@
+"""Figures of the paper's case studies: latent space, state plane, trajectories, frames, losses."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.viz.plane import (
+    BARRIER_COLOUR,
+    KERNEL_COLOUR,
+    PATH_COLOURS,
+    POINTS,
+    Plane,
+    array,
+    new_figure,
+    require,
+    zero_level,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_POINT_SIZE = {0: 5, 1: 9, 2: 9}
+
+
+def _codes(region: Any, n: int) -> np.ndarray:
+    """Region codes as ``(n,)`` integers."""
+    r = torch.as_tensor(region)
+    codes = array("region", r[:, 0] if r.ndim == 2 and r.shape[1] == 1 else r, (n,)).astype(int)
+    if not np.isin(codes, list(POINTS)).all():
+        raise ConfigError(f"region: expected codes {sorted(POINTS)}, received {sorted(set(codes.tolist()))[:8]}.")
+    return codes
+
+
+def _thin(codes: np.ndarray, limit: int) -> np.ndarray:
+    """Rows to draw: at most ``limit`` of each region, the same ones every time."""
+    order = np.random.default_rng(0)
+    rows = [np.nonzero(codes == code)[0] for code in POINTS]
+    return np.sort(np.concatenate([r if len(r) <= limit else order.choice(r, limit, replace=False) for r in rows]))
+
+
+def _scatter(ax: Any, points: np.ndarray, codes: np.ndarray, **style: Any) -> None:
+    for code, (colour, marker, label) in POINTS.items():
+        p = points[codes == code]
+        if len(p):
+            ax.scatter(
+                *p.T, s=_POINT_SIZE[code], c=colour, marker=marker, linewidths=0, alpha=0.75, label=label, **style
+            )
+
+
+def latent_space(
+    latent: Any,
+    region: Any,
+    barrier: Callable[[Tensor], Tensor] | None = None,
+    *,
+    max_points: int = 1500,
+    near: float = 0.02,
+) -> Figure:
+    r"""Latent points of S, U and the buffer, with the zero level of the barrier.
+
+    A latent of two dimensions is shown as it is, with the line B(z) = 0; of three, from two sides; of more, in its
+    first two principal components. Where no line can be drawn, points with \|B(z)\| <= ``near`` are marked black.
+
+    Args:
+        latent: ``(n, p)``, p >= 2, in [-1, 1].
+        region: ``(n,)`` or ``(n, 1)`` codes: 0 buffer, 1 safe, 2 unsafe.
+        barrier: ``(n, p) -> (n, 1)``; None: no level is drawn.
+        max_points: points drawn of each region at most.
+        near: barrier value up to which a point counts as on the border.
+
+    Returns:
+        The figure; its label is a caption.
+
+    Raises:
+        ShapeError, ConfigError, NonFiniteError: the latents or codes are not what was expected.
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Section V, figure "plot_latent_pend"; deviation: none.
+
+    Example:
+        >>> z = torch.rand(100, 2) * 2 - 1
+        >>> figure = latent_space(z, (z[:, :1] > 0).long() + 1, lambda z: z[:, :1])
+        >>> len(figure.axes)
+        1
+    """
+    z = array("latent", latent, (None, None))
+    n, p = z.shape
+    if p < 2 or n < 1:
+        raise ShapeError(f"latent: expected shape (n, p) with n >= 1 and p >= 2, received {z.shape}.")
+    codes = _codes(region, n)
+    value = None if barrier is None else _evaluate(barrier, z)
+    rows = _thin(codes, max_points)
+    border = np.zeros(0, int)
+    if value is not None:
+        border = np.nonzero(np.abs(value) <= near)[0]
+        border = border[:: max(1, math.ceil(len(border) / max_points))]
+    caption = "Latent points of S, U and the unlabelled buffer"
+    style = dict(s=5, c=BARRIER_COLOUR, marker=".", linewidths=0, label=f"|B| \u2264 {near:g}")
+    if p == 3:
+        require("mpl_toolkits.mplot3d")
+        figure = new_figure(9.2, 4.6, f"{caption}, seen from two sides; black: the border of the learned safe set.")
+        for k, azimuth in enumerate((-60, 30)):
+            ax = figure.add_subplot(1, 2, k + 1, projection="3d")
+            _scatter(ax, z[rows], codes[rows], depthshade=False)
+            if len(border):
+                ax.scatter(*z[border].T, depthshade=False, **style)  # type: ignore[misc]
+            ax.set(xlabel="z\u2081", ylabel="z\u2082", zlabel="z\u2083")  # type: ignore[call-arg]
+            ax.view_init(elev=22, azim=azimuth)  # type: ignore[attr-defined]
+            ax.tick_params(labelsize=7, pad=-2)
+            for axis in (ax.xaxis, ax.yaxis, ax.zaxis):  # type: ignore[attr-defined]
+                axis.set_ticks([-1, 0, 1])
+                axis.labelpad = -6
+            ax.set_box_aspect(None, zoom=0.92)  # type: ignore[call-arg, arg-type]
+    elif p == 2:
+        figure = new_figure(6, 5, f"{caption}; black line: B = 0.")
+        ax = figure.add_subplot()
+        if barrier is not None:
+            axis = np.linspace(-1, 1, 201)
+            nodes = np.stack(np.meshgrid(axis, axis), -1)
+            level = _evaluate(barrier, nodes.reshape(-1, 2)).reshape(201, 201)
+            top = np.abs(level).max() or 1.0
+            shade = ax.contourf(
+                axis, axis, level, levels=np.linspace(-top, top, 13), cmap="PuOr_r", alpha=0.35, zorder=0
+            )
+            figure.colorbar(shade, ax=ax, label="B(z)")
+            zero_level(ax, axis, axis, level, colors=BARRIER_COLOUR, linewidths=1.8)
+        _scatter(ax, z[rows], codes[rows], zorder=2)
+        ax.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), xlabel="z\u2081", ylabel="z\u2082", aspect="equal")
+    else:
+        figure = new_figure(6, 5, f"{caption} in the first two principal components; black: near the barrier's zero.")
+        centred = z - z.mean(0)
+        _, size, direction = np.linalg.svd(centred, full_matrices=False)
+        share = size**2 / max(float((size**2).sum()), 1e-30)
+        flat = centred @ direction[:2].T
+        ax = figure.add_subplot()
+        _scatter(ax, flat[rows], codes[rows])
+        if len(border):
+            ax.scatter(*flat[border].T, **style)  # type: ignore[arg-type]
+        ax.set(xlabel=f"component 1 ({share[0]:.0%} of variance)", ylabel=f"component 2 ({share[1]:.0%})")
+    handles, labels = figure.axes[0].get_legend_handles_labels()
+    if p == 2 and barrier is not None:
+        handles.append(_line(BARRIER_COLOUR, "B = 0"))
+        labels.append("B = 0")
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, markerscale=1.8)
+    return figure
+
+
+def _evaluate(barrier: Callable[[Tensor], Tensor], latent: np.ndarray) -> np.ndarray:
+    with torch.no_grad():
+        value = barrier(torch.as_tensor(latent, dtype=torch.float32))
+    if value.shape != (len(latent), 1):
+        raise ShapeError(f"barrier: expected values of shape ({len(latent)}, 1), received {tuple(value.shape)}.")
+    return value[:, 0].double().numpy()
+
+
+def _line(colour: str, label: str, style: str = "-") -> Any:
+    return require("matplotlib.lines").Line2D([], [], color=colour, linestyle=style, linewidth=1.8, label=label)
+
+
+def state_plane(
+    plane: Plane,
+    states: Any,
+    barrier: Any,
+    *,
+    viable: Any | None = None,
+    points: Any | None = None,
+    region: Any | None = None,
+    max_points: int = 400,
+    reduce: str = "max",
+) -> Figure:
+    """Plane of two state coordinates: S and U as areas, the line B = 0, the true kernel's border, sampled points.
+
+    Args:
+        plane: the coordinates shown, their range, S and U.
+        states: ``(n, dim)`` all nodes of a regular grid.
+        barrier: ``(n,)`` or ``(n, 1)`` barrier value of the observation of each state.
+        viable: ``(n,)`` whether each state is in the true viability kernel (bool), or its value (float, positive
+            inside: a smoother line).
+        points: ``(m, dim)`` sampled states to mark.
+        region: ``(m,)`` or ``(m, 1)`` their codes: 0 buffer, 1 safe, 2 unsafe.
+        max_points: points drawn of each region at most.
+        reduce: over coordinates not shown, see ``Plane.grid``.
+
+    Returns:
+        The figure; its label is a caption.
+
+    Raises:
+        ShapeError, NonFiniteError, ConfigError: an argument is not what was expected.
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Section V, figures "sys_pend" and "plot_real_pend"; deviation: the true kernel is added.
+
+    Example:
+        >>> from torchrl_sspl.sets import Box
+        >>> space = Box([-1.0, -1.0], [1.0, 1.0])
+        >>> states = space.grid(21)
+        >>> plane = Plane(("x", "y"), [-1, -1], [1, 1], safe_set=Box([-0.1, -0.1], [0.1, 0.1]))
+        >>> state_plane(plane, states, states.norm(dim=-1) - 0.5).axes[0].get_xlabel()
+        'x'
+    """
+    values = {"barrier": barrier}
+    if viable is not None:
+        v = torch.as_tensor(viable)
+        values["viable"] = v if v.dtype == torch.bool else -v  # negative inside, like a barrier
+    x, y, table = plane.grid(states, values, reduce)
+    figure = new_figure(
+        6.6,
+        5.2,
+        "Learned safe set {B \u2264 0} (inside the black line) in the state plane, with the labelled sets S (green) and "
+        "U (red)" + (", and the border of the true viability kernel (blue)." if viable is not None else "."),
+    )
+    ax = figure.add_subplot()
+    plane.draw(ax)
+    handles = plane.set_handles()
+    inside = table["barrier"] <= 0
+    if inside.any():
+        ax.contourf(x, y, table["barrier"], levels=[-np.inf, 0], colors=["#22304a"], alpha=0.13, zorder=1)
+    if "viable" in table and zero_level(
+        ax, x, y, table["viable"], colors=KERNEL_COLOUR, linewidths=1.6, linestyles="--", zorder=3
+    ):
+        handles.append(_line(KERNEL_COLOUR, "true viability kernel", "--"))
+    if zero_level(ax, x, y, table["barrier"], colors=BARRIER_COLOUR, linewidths=2.0, zorder=4):
+        handles.append(_line(BARRIER_COLOUR, "B = 0"))
+    else:
+        ax.set_title("B \u2264 0 nowhere" if not inside.any() else "B \u2264 0 everywhere", fontsize=10)
+    if points is not None:
+        p = array("points", points, (None, plane.dim))
+        codes = np.zeros(len(p), int) if region is None else _codes(region, len(p))
+        rows = _thin(codes, max_points)
+        _scatter(ax, p[rows][:, list(plane.coords)], codes[rows], zorder=2)
+        handles += ax.get_legend_handles_labels()[0]
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, markerscale=1.8)
+    return figure
+
+
+def trajectories(
+    plane: Plane,
+    states: Any,
+    actions: Any,
+    barrier: Any | None = None,
+    *,
+    background: tuple[Any, Any] | None = None,
+    action_name: str = "action",
+    action_direction: tuple[float, float] | None = None,
+    action_scale: float | None = None,
+    dt: float | None = None,
+    episodes: int = 6,
+    arrows: int = 14,
+    caption: str = "",
+) -> Figure:
+    """Closed-loop trajectories with their actions as arrows, and barrier and action over time.
+
+    Args:
+        plane: the coordinates shown, their range, S and U.
+        states: ``(T + 1, n, dim)`` visited states.
+        actions: ``(T, n, m)`` actions, in physical units; the first component is drawn.
+        barrier: ``(T + 1, n)`` barrier values on the way; None: no panel of its own.
+        background: grid states ``(k, dim)`` and their barrier values ``(k,)``, of which the zero level is drawn.
+        action_name: name and unit of the action.
+        action_direction: direction in the plane of a positive action (the pendulum's torque pushes the angular
+            velocity: ``(0, 1)``); None: along the path.
+        action_scale: action with the longest arrow; default: the largest.
+        dt: time step in s; None: the time axis counts steps.
+        episodes: trajectories drawn at most, with starts far apart.
+        arrows: arrows per trajectory, at most.
+        caption: what the figure shows.
+
+    Returns:
+        The figure; its label is a caption.
+
+    Raises:
+        ShapeError, NonFiniteError: an argument is not what was expected.
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Section V, figures "sspl_pend" and "traj_sspl_gr"; deviation: time series are added.
+
+    Example:
+        >>> plane = Plane(("x", "y"), [-1, -1], [1, 1])
+        >>> figure = trajectories(plane, torch.zeros(5, 2, 2), torch.ones(4, 2, 1), torch.zeros(5, 2))
+        >>> len(figure.axes)
+        3
+    """
+    x = array("states", states, (None, None, plane.dim))
+    steps, n = x.shape[0] - 1, x.shape[1]
+    if steps < 1 or n < 1:
+        raise ShapeError(f"states: expected shape (T + 1, n, {plane.dim}) with T, n >= 1, received {x.shape}.")
+    u = array("actions", actions, (steps, n, None))[..., 0]
+    values = None if barrier is None else array("barrier", barrier, (steps + 1, n))
+    extent = np.array([plane.high[k] - plane.low[k] for k in plane.coords])
+    chosen = _spread(x[0][:, list(plane.coords)] / extent, min(episodes, n))
+    largest = action_scale or max(float(np.abs(u).max()), 1e-12)
+    size = f"; the longest arrow is {largest:.3g} in {action_name}"
+    figure = new_figure(10.5, 5.0, (caption or f"{len(chosen)} trajectories of the learned policy") + size + ".")
+    grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
+    ax = figure.add_subplot(grid[:, 0])
+    plane.draw(ax, cover=x[:, chosen][..., list(plane.coords)].reshape(-1, 2))
+    handles = plane.set_handles()
+    if background is not None:
+        gx, gy, table = plane.grid(background[0], {"barrier": background[1]})
+        if zero_level(ax, gx, gy, table["barrier"], colors=BARRIER_COLOUR, linewidths=1.8, zorder=2):
+            handles.append(_line(BARRIER_COLOUR, "B = 0"))
+    every = max(1, steps // arrows)
+    marker = require("matplotlib.lines").Line2D
+    for colour, k in zip(np.resize(PATH_COLOURS, len(chosen)), chosen):
+        path = x[:, k][:, list(plane.coords)]
+        ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.2, zorder=3)
+        ax.plot(*path[0], "o", color=colour, markersize=5, markeredgecolor="white", zorder=5)
+        at = _spaced(path / extent, every, 0.02)
+        along = _directions(path / extent, action_direction)
+        length = 0.13 * extent * along * (u[:, k] if action_direction is not None else np.abs(u[:, k]))[:, None] / largest
+        ax.quiver(
+            *path[at].T,
+            *length[at].T,
+            angles="xy",
+            scale_units="xy",
+            scale=1,
+            width=0.005,
+            headwidth=4,
+            headlength=4.5,
+            headaxislength=4,
+            minlength=0.3,
+            color=colour,
+            zorder=4,
+            alpha=0.9,
+        )
+    handles.append(marker([], [], marker="o", color="#555555", linewidth=1.2, label="start and path"))
+    arrow = "$\\uparrow$" if action_direction is not None else "$\\rightarrow$"
+    handles.append(marker([], [], marker=arrow, color="#555555", linestyle="", markersize=9, label=f"{action_name}, size"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
+
+    time = np.arange(steps + 1) * (dt or 1.0)
+    colours = list(zip(np.resize(PATH_COLOURS, len(chosen)), chosen))
+    if values is not None:
+        upper = figure.add_subplot(grid[0, 1])
+        for colour, k in colours:
+            upper.plot(time, values[:, k], color=colour, linewidth=1.2)
+        upper.axhline(0, color=BARRIER_COLOUR, linewidth=1.0, linestyle=":")
+        upper.set(ylabel="B(z)", xlim=(0, time[-1]))
+        upper.tick_params(labelbottom=False)
+    lower = figure.add_subplot(grid[1 if values is not None else slice(None), 1])
+    for colour, k in colours:
+        lower.step(time[:-1], u[:, k], where="post", color=colour, linewidth=0.8, alpha=0.85)
+    lower.axhline(0, color="#999999", linewidth=0.8)
+    lower.set(ylabel=action_name, xlabel="time [s]" if dt else "step", xlim=(0, time[-1]))
+    return figure
+
+
+def _spread(points: np.ndarray, count: int) -> np.ndarray:
+    """Rows of ``count`` points that lie far apart, the first one first."""
+    chosen = [0]
+    distance = np.linalg.norm(points - points[0], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return np.unique(chosen)
+
+
+def _spaced(path: np.ndarray, every: int, gap: float) -> np.ndarray:
+    """Steps at which an arrow is drawn: every so many, none where the path hardly moved since the last one."""
+    chosen = [0]
+    for t in range(every, len(path) - 1, every):
+        if np.abs(path[t] - path[chosen[-1]]).max() > gap:
+            chosen.append(t)
+    return np.array(chosen)
+
+
+def _directions(path: np.ndarray, fixed: tuple[float, float] | None) -> np.ndarray:
+    """Unit vectors ``(T, 2)`` of the arrows, in shares of the plane."""
+    if fixed is not None:
+        d = np.tile(np.asarray(fixed, float), (len(path) - 1, 1))
+    else:
+        d = np.diff(path, axis=0)
+        d[np.abs(d).max(1) > 0.5] = 0.0  # the step over the edge of a periodic coordinate
+    return d / np.maximum(np.linalg.norm(d, axis=1, keepdims=True), 1e-12)
+
+
+def frames(env: Any, states: Any, *, captions: Sequence[str] | None = None, both: bool = True) -> Figure:
+    """Strip of the frames that the agent sees.
+
+    Args:
+        env: has ``observe(states) -> uint8 (n, 6, H, W)``.
+        states: ``(n, state_dim)``, n <= 12.
+        captions: one per state; default: its coordinates.
+        both: show the frame of the step before as well, in a row of its own.
+
+    Returns:
+        The figure; its label is a caption.
+
+    Raises:
+        ShapeError: there is no state, too many, or another number of captions.
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Section V, figures "sys_pend" and "sspl_gr"; deviation: none.
+
+    Example:
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> len(frames(PendulumEnv(), torch.tensor([[0.0, 0.0], [1.0, 0.0]])).axes)
+        4
+    """
+    x = array("states", states, (None, None))
+    n = len(x)
+    if not 1 <= n <= 12:
+        raise ShapeError(f"states: expected 1 to 12 states, received {n}.")
+    names = list(captions) if captions is not None else [", ".join(f"{v:+.2f}" for v in row) for row in x]
+    if len(names) != n:
+        raise ShapeError(f"captions: expected {n}, one per state, received {len(names)}.")
+    pixels = env.observe(torch.as_tensor(states, dtype=torch.float32)).cpu()
+    rows = 2 if both else 1
+    figure = new_figure(1.25 * n + 0.4, 1.25 * rows + 0.35, "Observations: what the agent sees, and nothing else.")
+    axes = figure.subplots(rows, n, squeeze=False)
+    for k in range(n):
+        for row in range(rows):
+            ax = axes[row, k]
+            channels = slice(0, 3) if both and row == 0 else slice(3, 6)
+            ax.imshow(pixels[k, channels].permute(1, 2, 0).numpy(), interpolation="nearest")
+            ax.set(xticks=[], yticks=[])
+        axes[0, k].set_title(names[k], fontsize=8)
+    for row in range(rows):
+        axes[row, 0].set_ylabel("t \u2212 1" if both and row == 0 else "t", fontsize=9)
+    return figure
+
+
+def read_log(path: str | Path) -> list[dict[str, Any]]:
+    """Rows of a training's ``log.jsonl``; a last line cut short by an interruption is left out.
+
+    Args:
+        path: the file.
+
+    Returns:
+        One dictionary per row, each with "phase", "round" and "step".
+
+    Raises:
+        CheckpointError: the file is missing, empty, or not a log.
+
+    Source: none.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"expected the log of a training at '{path}', found no file; give a run's log.jsonl.")
+    lines = path.read_text().splitlines()
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+            rows.append({**row, "phase": str(row["phase"]), "round": int(row["round"]), "step": int(row["step"])})
+        except (ValueError, KeyError, TypeError) as error:
+            if number == len(lines) and rows:
+                break
+            raise CheckpointError(
+                f"expected JSON with phase, round and step in line {number} of '{path}', received {line[:60]!r}."
+            ) from error
+    if not rows:
+        raise CheckpointError(f"expected at least one row in '{path}', received an empty log.")
+    return rows
+
+
+def training_curves(path: str | Path) -> Figure:
+    """Losses of every phase of a training over its optimiser steps, and the held-out checks of every round.
+
+    Args:
+        path: a run's ``log.jsonl``: one JSON object per line with ``phase``, ``round``, ``step`` and ``loss_*``.
+
+    Returns:
+        The figure, one panel per phase; its label is a caption.
+
+    Raises:
+        CheckpointError: the file is missing, empty, or not a log.
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Algorithm 1 (phases); the paper shows no curves.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.NamedTemporaryFile("w", suffix=".jsonl") as file:
+        ...     _ = file.write('{"phase": "fit", "round": 0, "step": 100, "loss_safe": 0.1}')
+        ...     file.flush()
+        ...     len(training_curves(file.name).axes)
+        1
+    """
+    log = read_log(path)
+    phases: dict[str, list[dict[str, Any]]] = {}
+    for row in log:
+        if any(k.startswith("loss") for k in row) or row["phase"] == "check":
+            phases.setdefault(row["phase"], []).append(row)
+    if not phases:
+        raise CheckpointError(f"expected losses or checks in '{path}', received {len(log)} rows without either.")
+    columns = min(3, len(phases))
+    lines = math.ceil(len(phases) / columns)
+    figure = new_figure(
+        4.0 * columns, 3.1 * lines, "Losses of every phase (rounds follow one another, dotted lines between them)."
+    )
+    for k, (phase, rows) in enumerate(phases.items()):
+        ax = figure.add_subplot(lines, columns, k + 1)
+        ax.set_title(phase, fontsize=10)
+        (_draw_checks if phase == "check" else _draw_losses)(ax, rows)
+        ax.tick_params(labelsize=8)
+    return figure
+
+
+def _draw_losses(ax: Axes, rows: list[dict[str, Any]]) -> None:
+    at, offset, last = [], 0, 0
+    previous = rows[0]["round"]
+    for row in rows:
+        if row["round"] != previous:
+            offset, previous = offset + last, row["round"]
+            ax.axvline(offset, color="#aaaaaa", linewidth=0.8, linestyle=":")
+        last = row["step"]
+        at.append(offset + last)
+    names = list(dict.fromkeys(k for row in rows for k in row if k.startswith("loss")))
+    for colour, name in zip(np.resize(PATH_COLOURS, len(names)), names):
+        value = np.array([float(row.get(name) or 0.0) for row in rows])
+        label = name.removeprefix("loss_").removeprefix("loss") or "total"
+        if (value > 0).any():
+            shown = np.where(value > 0, value, np.nan)
+            ax.plot(at, shown, ".-", color=colour, linewidth=1.0, markersize=3, label=label)
+        else:
+            ax.plot([], [], color=colour, label=f"{label} (0)")
+    if any((float(row.get(n) or 0.0)) > 0 for row in rows for n in names):
+        ax.set_yscale("log")
+    ax.set_xlabel("step", fontsize=8)
+    _legend_below(ax)
+
+
+def _legend_below(ax: Axes) -> None:
+    ax.legend(
+        fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3, labelspacing=0.25,
+        columnspacing=1.0, handlelength=1.4,
+    )
+
+
+def _draw_checks(ax: Axes, rows: list[dict[str, Any]]) -> None:
+    number = [row["round"] for row in rows]
+    for colour, name, label in ((PATH_COLOURS[0], "size", "size of the set"), (PATH_COLOURS[1], "returned", "returned")):
+        ax.plot(number, [float(row.get(name) or 0.0) for row in rows], "o-", color=colour, linewidth=1.1, label=label)
+    failed = [row for row in rows if not row.get("passed")]
+    ax.plot(
+        [r["round"] for r in failed],
+        [float(r.get("size") or 0.0) for r in failed],
+        "x",
+        color="#c8372d",
+        markersize=10,
+        label="check failed",
+    )
+    ax.set(ylim=(-0.03, 1.03), xticks=sorted(set(number)))
+    ax.set_xlabel("round", fontsize=8)
+    ax.set_ylabel("share", fontsize=8)
+    _legend_below(ax)

@@ -1,0 +1,343 @@
+"""The plane of two state coordinates in which sets and trajectories are drawn, and the style of all figures."""
+
+from __future__ import annotations
+
+import importlib
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, NonFiniteError, ShapeError
+from torchrl_sspl.sets import Box, Difference, Region
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Fill colours of the sets, as in the paper: light green for S, light red for U.
+SAFE_FILL, UNSAFE_FILL, OUTSIDE_FILL = "#cdeccd", "#fadcd7", "#e3e5e8"
+#: Colours and markers of points: they differ in shape too, for readers who do not tell red from green.
+POINTS: dict[int, tuple[str, str, str]] = {
+    0: ("#6b7280", "s", "buffer"),
+    2: ("#c8372d", "^", "unsafe (U)"),
+    1: ("#15803d", "o", "safe (S)"),
+}
+BARRIER_COLOUR, KERNEL_COLOUR, PATH_COLOURS = (
+    "#111111",
+    "#1d4ed8",
+    ("#0072b2", "#d55e00", "#6b4c9a", "#00806b", "#b8860b", "#c2185b", "#4d6a00", "#5c5c5c"),
+)
+
+
+def require(module: str, extra: str = "viz") -> Any:
+    """Import an optional module, or say how to install it.
+
+    Args:
+        module: name of the module.
+        extra: extra of this package that installs it.
+
+    Returns:
+        The module.
+
+    Raises:
+        MissingDependencyError: it is not installed.
+
+    Source: none.
+
+    Example:
+        >>> require("math").pi > 3
+        True
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"expected the module '{module}', which is not installed; pip install 'torchrl-sspl[{extra}]'."
+        ) from error
+
+
+def new_figure(width: float, height: float, caption: str = "") -> Figure:
+    """Empty figure of its own, outside pyplot's global state; its label is the caption that a report prints.
+
+    Args:
+        width, height: size in inches.
+        caption: what the figure shows, in a sentence.
+
+    Returns:
+        The figure, drawn by the Agg backend.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: none.
+
+    Example:
+        >>> new_figure(4, 3, "Nothing yet.").get_label()
+        'Nothing yet.'
+    """
+    agg = require("matplotlib.backends.backend_agg")
+    figure = require("matplotlib.figure").Figure(figsize=(width, height), layout="constrained", facecolor="white")
+    agg.FigureCanvasAgg(figure)
+    figure.set_label(caption)
+    return figure
+
+
+def array(name: str, value: Any, shape: tuple[int | None, ...], *, finite: bool = True) -> np.ndarray:
+    """Values as a NumPy array of a given shape (None: any size).
+
+    Args:
+        name: name of the argument, for messages.
+        value: tensor, array or nested list.
+        shape: expected shape.
+        finite: refuse NaN and infinity.
+
+    Returns:
+        float64 array, or bool where the values are bool.
+
+    Raises:
+        ShapeError, DTypeError, NonFiniteError: the values are not what was expected.
+
+    Source: none.
+
+    Example:
+        >>> array("x", [[1, 2]], (None, 2)).shape
+        (1, 2)
+    """
+    try:
+        tensor = torch.as_tensor(value).detach().cpu()
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DTypeError(f"{name}: expected a tensor of numbers, received {type(value).__name__}.") from error
+    fits = tensor.ndim == len(shape) and all(w is None or n == w for n, w in zip(tensor.shape, shape, strict=True))
+    if not fits:
+        wanted = "(" + ", ".join("n" if w is None else str(w) for w in shape) + ")"
+        raise ShapeError(f"{name}: expected shape {wanted}, received {tuple(tensor.shape)}.")
+    out = tensor.numpy() if tensor.dtype == torch.bool else tensor.double().numpy()
+    if finite and not np.isfinite(out).all():
+        raise NonFiniteError(f"{name}: expected finite values, received {int((~np.isfinite(out)).sum())} that are not.")
+    return out
+
+
+@dataclass
+class Plane:
+    """Two coordinates of the state, with the range in which they are shown and the labelled sets.
+
+    Args:
+        names: names and units of the two coordinates.
+        low, high: corners of the state space, one number per state coordinate.
+        period: period per state coordinate, 0 where there is none.
+        safe_set, unsafe_set: S and U, filled light green and light red; None: not drawn.
+        coords: which two coordinates of the state are shown.
+        fixed: values of the other coordinates at which S and U are drawn; default: the middle of their range.
+
+    Raises:
+        ConfigError: the coordinates or the range are not valid.
+
+    Source: paper Section V, figure "plot_real_pend".
+
+    Example:
+        >>> Plane(("x [m]", "y [m]"), [-2.0, -2.0, -3.14], [2.0, 2.0, 3.14]).dim
+        3
+    """
+
+    names: tuple[str, str]
+    low: list[float]
+    high: list[float]
+    period: list[float] = field(default_factory=list)
+    safe_set: Region | None = None
+    unsafe_set: Region | None = None
+    coords: tuple[int, int] = (0, 1)
+    fixed: dict[int, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.low, self.high = [float(v) for v in self.low], [float(v) for v in self.high]
+        self.period = [float(p) for p in self.period] or [0.0] * self.dim
+        i, j = self.coords
+        if not (0 <= i < self.dim and 0 <= j < self.dim and i != j):
+            raise ConfigError(f"coords: expected two different coordinates below {self.dim}, received {self.coords}.")
+        if not len(self.low) == len(self.high) == len(self.period):
+            raise ConfigError(
+                f"plane: expected low, high and period of one length, received {len(self.low)}, {len(self.high)}, "
+                f"{len(self.period)}."
+            )
+        if any(a >= b for a, b in zip(self.low, self.high, strict=True)):
+            raise ConfigError(f"plane: expected low < high, received {self.low} and {self.high}.")
+
+    @classmethod
+    def of(
+        cls,
+        env: Any,
+        names: tuple[str, str] = ("x0", "x1"),
+        *,
+        coords: tuple[int, int] = (0, 1),
+        fixed: dict[int, float] | None = None,
+    ) -> Plane:
+        """Plane of an environment's state space with its safe and unsafe sets.
+
+        Args:
+            env: has ``state_space`` (a box, or a box with holes), ``safe_set`` and ``unsafe_set``.
+            names: names and units of the two coordinates.
+            coords: which two coordinates of the state are shown.
+            fixed: values of the other coordinates at which S and U are drawn.
+
+        Returns:
+            The plane.
+
+        Raises:
+            ConfigError: the state space is not a box.
+
+        Source: none.
+        """
+        space = env.state_space
+        while isinstance(space, Difference):
+            space = space.a
+        if not isinstance(space, Box):
+            raise ConfigError(
+                f"plane: expected an environment whose state_space is a Box, received {type(space).__name__}; build the "
+                "Plane from low and high."
+            )
+        return cls(
+            names,
+            space.low.tolist(),
+            space.high.tolist(),
+            space.period.tolist(),
+            env.safe_set,
+            env.unsafe_set,
+            coords,
+            dict(fixed or {}),
+        )
+
+    @property
+    def dim(self) -> int:
+        """Size of the state."""
+        return len(self.low)
+
+    def draw(self, ax: Axes, *, cover: np.ndarray | None = None, resolution: int = 480) -> None:
+        """Axes with names and limits, and the sets S and U as areas; what lies outside the state space is grey.
+
+        Args:
+            ax: matplotlib axes to draw on.
+            cover: ``(k, 2)`` points in the plane that must be seen, even outside the state space.
+            resolution: pixels per coordinate of the areas.
+        """
+        i, j = self.coords
+        corners = np.array([[self.low[i], self.low[j]], [self.high[i], self.high[j]]])
+        lower, upper = corners if cover is None else (
+            np.minimum(corners[0], cover.min(0)), np.maximum(corners[1], cover.max(0))
+        )
+        # A little room beyond a point, none where the state space itself is the limit.
+        lower, upper = (b + 0.03 * (b - c) / np.maximum(np.abs(b - c), 1e-9) * (upper - lower) * (np.abs(b - c) > 1e-5)
+                        for b, c in zip((lower, upper), corners))
+        extent = (float(lower[0]), float(upper[0]), float(lower[1]), float(upper[1]))
+        state = torch.tensor([self.fixed.get(k, (a + b) / 2) for k, (a, b) in enumerate(zip(self.low, self.high))])
+        state = state.repeat(resolution * resolution, 1)
+        # Centres of the pixels, so that an area ends where its set ends.
+        middle = (torch.arange(resolution) + 0.5) / resolution
+        y, x = torch.meshgrid(middle, middle, indexing="ij")
+        state[:, i] = (extent[0] + (extent[1] - extent[0]) * x).reshape(-1)
+        state[:, j] = (extent[2] + (extent[3] - extent[2]) * y).reshape(-1)
+        to_rgb = require("matplotlib.colors").to_rgb
+        image = np.ones((resolution * resolution, 3))
+        for region, colour in ((self.unsafe_set, UNSAFE_FILL), (self.safe_set, SAFE_FILL)):
+            if region is not None:
+                image[region.contains(state).numpy()] = to_rgb(colour)
+        shown = state[:, [i, j]].numpy()
+        image[((shown < corners[0]) | (shown > corners[1])).any(1)] = to_rgb(OUTSIDE_FILL)
+        ax.imshow(
+            image.reshape(resolution, resolution, 3),
+            extent=extent,
+            origin="lower",
+            aspect="auto",
+            interpolation="nearest",
+            zorder=0,
+        )
+        ax.set(xlim=extent[:2], ylim=extent[2:], xlabel=self.names[0], ylabel=self.names[1])
+        for axis, k in ((ax.xaxis, i), (ax.yaxis, j)):
+            if math.isclose(self.period[k], 2 * math.pi, rel_tol=1e-4):
+                ticks = [-math.pi, -math.pi / 2, 0, math.pi / 2, math.pi]
+                labels = ["\u2212\u03c0", "\u2212\u03c0/2", "0", "\u03c0/2", "\u03c0"]
+                shown = [(t, s) for t, s in zip(ticks, labels) if self.low[k] - 1e-3 <= t <= self.high[k] + 1e-3]
+                axis.set_ticks([t for t, _ in shown], [s for _, s in shown])
+
+    def set_handles(self) -> list[Any]:
+        """Legend entries of the areas."""
+        patch = require("matplotlib.patches").Patch
+        pairs = ((self.safe_set, SAFE_FILL, "S"), (self.unsafe_set, UNSAFE_FILL, "U"))
+        return [patch(facecolor=c, edgecolor="#9a9a9a", linewidth=0.5, label=s) for r, c, s in pairs if r is not None]
+
+    def grid(
+        self, states: Any, values: dict[str, Any], reduce: str = "max"
+    ) -> tuple[np.ndarray, np.ndarray, dict[str, np.ndarray]]:
+        """Values on a full grid of states as matrices over the two coordinates shown.
+
+        Args:
+            states: ``(n, dim)`` all nodes of a regular grid, in any order.
+            values: by name, ``(n,)`` or ``(n, 1)``; positive means outside a set for floats, True inside for bools.
+            reduce: over the coordinates not shown: ``"max"`` takes the largest value and "for all" of booleans,
+                ``"min"`` the smallest and "for some"; a coordinate in ``fixed`` is taken at the nearest node instead.
+
+        Returns:
+            The two axes, ``(a,)`` and ``(b,)``, and the matrices ``(b, a)``.
+
+        Raises:
+            ShapeError: the states are not a full grid, or a value does not fit them.
+            ConfigError: ``reduce`` is not known.
+
+        Source: none.
+        """
+        if reduce not in ("max", "min"):
+            raise ConfigError(f"reduce: expected 'max' or 'min', received {reduce!r}.")
+        x = array("states", states, (None, self.dim))
+        axes, index = zip(*(np.unique(x[:, k], return_inverse=True) for k in range(self.dim)), strict=True)
+        sizes = tuple(len(a) for a in axes)
+        flat = np.ravel_multi_index(index, sizes)
+        if math.prod(sizes) != len(x) or len(np.unique(flat)) != len(x):
+            raise ShapeError(
+                f"states: expected all nodes of a regular grid, received {len(x)} states with {' x '.join(map(str, sizes))} "
+                "different coordinates; use state_space.grid(n)."
+            )
+        out = {}
+        for name, value in values.items():
+            v = torch.as_tensor(value)
+            v = array(name, v[:, 0] if v.ndim == 2 else v, (len(x),))
+            table = np.empty(sizes, v.dtype)
+            table.reshape(-1)[flat] = v
+            for k in reversed([k for k in range(self.dim) if k not in self.coords]):
+                if k in self.fixed:
+                    table = table.take(int(np.abs(axes[k] - self.fixed[k]).argmin()), axis=k)
+                else:
+                    # For a bool, "in the set for all" is the smallest; for a barrier it is the largest value.
+                    largest = (reduce == "max") != (v.dtype == bool)
+                    table = table.max(axis=k) if largest else table.min(axis=k)
+            out[name] = table.T if self.coords[0] < self.coords[1] else table
+        return axes[self.coords[0]], axes[self.coords[1]], out
+
+    def unwrap_breaks(self, path: np.ndarray) -> np.ndarray:
+        """Path ``(t, 2)`` in the plane with a row of NaN wherever a periodic coordinate jumps."""
+        period = np.array([self.period[k] for k in self.coords])
+        jump = ((np.abs(np.diff(path, axis=0)) > period / 2) & (period > 0)).any(1)
+        return np.insert(path, np.nonzero(jump)[0] + 1, np.nan, axis=0)
+
+
+def zero_level(ax: Axes, x: np.ndarray, y: np.ndarray, value: np.ndarray, **style: Any) -> Any | None:
+    """Contour line of a matrix at zero (of a bool: its border), or None where there is none.
+
+    Args:
+        ax: matplotlib axes.
+        x, y: ``(a,)`` and ``(b,)``.
+        value: ``(b, a)``.
+        style: colours, linewidths, ... of the line.
+
+    Returns:
+        The contour set, if the value changes its sign.
+
+    Source: none.
+    """
+    level = 0.5 if value.dtype == bool else 0.0
+    inside = value.astype(float) > level
+    if not inside.any() or inside.all():
+        return None
+    return ax.contour(x, y, value.astype(float), levels=[level], **style)

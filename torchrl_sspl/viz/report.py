@@ -1,0 +1,402 @@
+"""One self-contained web page per run: the verdict first, then everything it rests on."""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+import platform
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, is_dataclass
+from html import escape
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.viz.report_style import CSS
+
+NOT_MEASURED = "not measured"
+_MIME = {
+    ".png": "image/png",
+    ".jpg": "image/jpeg",
+    ".jpeg": "image/jpeg",
+    ".gif": "image/gif",
+    ".webp": "image/webp",
+    ".svg": "image/svg+xml",
+    ".mp4": "video/mp4",
+    ".webm": "video/webm",
+}
+_ASSUMED = (
+    "Measured figures hold for the distribution that they were sampled from, with the stated confidence: independent "
+    "states drawn uniformly from the named set, the simulator's dynamics and its pictures.",
+    "Nothing is said about other cameras, other physics or states outside the state space.",
+)
+
+
+def format_value(value: Any, unit: str = "") -> str:
+    """A figure for people: shares in per cent, four digits, "not measured" for None and NaN.
+
+    Args:
+        value: number, bool, text or None.
+        unit: "share" prints per cent; other units are appended.
+
+    Returns:
+        The text, not escaped.
+
+    Source: none.
+
+    Example:
+        >>> format_value(0.0012, "share"), format_value(float("nan")), format_value(1.98765, "m")
+        ('0.12 %', 'not measured', '1.988 m')
+    """
+    if value is None:
+        return NOT_MEASURED
+    if hasattr(value, "item") and getattr(value, "shape", None) in ((), None):
+        value = value.item()
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return {True: "yes", False: "no"}.get(value, str(value)) if isinstance(value, bool) else str(value)
+    if math.isnan(value):
+        return NOT_MEASURED
+    if math.isinf(value):
+        return "\u221e" if value > 0 else "\u2212\u221e"
+    if unit == "share":
+        return _number(100 * value) + " %"
+    return _number(value) + (f" {unit}" if unit and unit not in ("ratio", "count") else "")
+
+
+def _number(value: float) -> str:
+    if isinstance(value, int):
+        return f"{value:,}"
+    if value and not 1e-4 <= abs(value) < 1e6:
+        return f"{value:.3g}"
+    text = f"{value:.4g}"
+    return f"{value:,.0f}" if "e" in text else text
+
+
+def _plain(name: str, value: Any) -> dict[str, Any]:
+    """A mapping or dataclass as a dictionary."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return asdict(value)
+    if isinstance(value, Mapping):
+        return dict(value)
+    if hasattr(value, "__dict__"):
+        return dict(vars(value))
+    raise ConfigError(f"{name}: expected a mapping or a dataclass, received {type(value).__name__}.")
+
+
+def _bound(m: Mapping[str, Any]) -> str:
+    """The 95 % bound of a share: one-sided where nothing (or everything) happened, else the interval."""
+    lower, upper, events, n = (m.get(k) for k in ("lower", "upper", "events", "n"))
+    if lower is None or upper is None or any(isinstance(v, float) and math.isnan(v) for v in (lower, upper)):
+        return "\u2013"
+    if events == 0:
+        return f"\u2264 {format_value(upper, 'share')}"
+    if events is not None and events == n:
+        return f"\u2265 {format_value(lower, 'share')}"
+    return f"{format_value(lower, 'share')} to {format_value(upper, 'share')}"
+
+
+def _count(value: Any) -> str:
+    return "\u2013" if value is None else format_value(value)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
+    """Table of cells that are HTML already; every cell knows its column, so that a phone can stack them."""
+    top = "".join(f'<th scope="col">{escape(h)}</th>' for h in head)
+    body = "".join(
+        "<tr>" + "".join(f'<td data-label="{escape(h)}">{c}</td>' for h, c in zip(head, row, strict=True)) + "</tr>"
+        for row in rows
+    )
+    return f'<div class="scroll"><table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
+
+
+def _verdict_kind(verdict: str) -> str:
+    """Class of a verdict: "good", "fair", "bad" or "none"."""
+    text = str(verdict).strip().lower()
+    if text.startswith(("aim", "proved", "yes", "pass")):
+        return "good"
+    if text.startswith("must"):
+        return "fair"
+    return "none" if not text or text.startswith("not measured") else "bad"
+
+
+_BADGES = {"good": "\u2713", "fair": "\u2713", "bad": "\u2717", "none": "?"}
+_WORDS = {"aim": "aim reached", "must": "must reached"}
+
+
+def _badge(verdict: str) -> str:
+    kind = _verdict_kind(verdict)
+    text = _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or NOT_MEASURED)
+    return f'<span class="badge {kind}">{_BADGES[kind]}&nbsp;{escape(text)}</span>'
+
+
+def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple[str, Any, str, str, str]]:
+    """Rows of the summary from a table of requirements and an evaluation.
+
+    Args:
+        requirements: each with ``name``, ``label``, ``sense`` ("<=" or ">="), ``must``, ``aim`` and
+            ``verdict(evaluation)``.
+        evaluation: has ``measurements`` by name.
+
+    Returns:
+        Rows (label, measurement or None, must, aim, verdict) for ``write_report``.
+
+    Source: none.
+    """
+    rows = []
+    for r in requirements:
+        m = evaluation.measurements.get(r.name)
+        unit = getattr(m, "unit", "share" if r.must <= 1 and r.aim <= 1 else "")
+        sign = {"<=": "\u2264", ">=": "\u2265"}[r.sense]
+        # Nothing lies below no event at all, nothing above all of them.
+        limits = [f"{'' if r.sense == '<=' and v == 0 else sign + ' '}{format_value(v, unit)}" for v in (r.must, r.aim)]
+        rows.append((r.label, m, limits[0], limits[1], r.verdict(evaluation)))
+    return rows
+
+
+def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> tuple[str, str, str]:
+    """Headline, its class, and the table with must and aim."""
+    kinds, out = [], []
+    for row in rows:
+        if len(row) != 5:
+            raise ShapeError(f"summary: expected rows (label, value, must, aim, verdict), received {len(row)} entries.")
+        label, value, must, aim, verdict = row
+        m = measurements.get(label, {})
+        if value is not None and not isinstance(value, (int, float, str)) and not hasattr(value, "item"):
+            m = _plain("summary", value)
+            value = m.get("value")
+        shown = format_value(value, m.get("unit", ""))
+        if shown == NOT_MEASURED:
+            verdict = NOT_MEASURED
+        kinds.append(_verdict_kind(verdict))
+        out.append(
+            [
+                escape(str(label)),
+                f"<b>{escape(shown)}</b>",
+                escape(_bound(m)),
+                escape(_count(m.get("n"))),
+                escape(format_value(must)),
+                escape(format_value(aim)),
+                _badge(verdict),
+            ]
+        )
+    reached, missed, unknown = (sum(k in group for k in kinds) for group in (("good", "fair"), ("bad",), ("none",)))
+    aims = kinds.count("good")
+    if not rows:
+        headline, kind = "No requirements were given", "none"
+    elif missed:
+        headline, kind = f"{missed} of {len(rows)} requirements missed", "bad"
+    elif unknown:
+        headline, kind = f"{reached} of {len(rows)} requirements reached, {unknown} not measured", "none"
+    else:
+        headline, kind = f"All {len(rows)} requirements reached", "good"
+    if reached:
+        headline += f"; {aims} of them at the aim" if not missed else f", {reached} reached"
+    head = ("Requirement", "Measured", "95 % bound", "n", "Must", "Aim", "Verdict")
+    return headline, kind, _table(head, out, kind="summary") if rows else ""
+
+
+def _data_uri(data: bytes, mime: str) -> str:
+    return f"data:{mime};base64,{base64.b64encode(data).decode()}"
+
+
+def _file_uri(path: str | Path) -> tuple[str, str]:
+    path = Path(path)
+    mime = _MIME.get(path.suffix.lower())
+    if mime is None or not path.is_file():
+        raise ConfigError(
+            f"figure or video: expected an existing file of type {', '.join(_MIME)}, received '{path}'; draw it first."
+        )
+    return _data_uri(path.read_bytes(), mime), mime
+
+
+def _media(uri: str, mime: str, alt: str) -> str:
+    if mime.startswith("video/"):
+        return f'<video controls loop muted playsinline preload="metadata" src="{uri}"></video>'
+    return f'<img alt="{escape(alt)}" src="{uri}">'
+
+
+def _figure(name: str, value: Any) -> str:
+    """One figure: a matplotlib Figure (its label is the caption), a path, or a pair (either, caption)."""
+    caption = ""
+    if isinstance(value, tuple) and len(value) == 2:
+        value, caption = value
+    if hasattr(value, "savefig"):
+        buffer = io.BytesIO()
+        value.savefig(buffer, format="png", dpi=130)
+        uri, mime = _data_uri(buffer.getvalue(), "image/png"), "image/png"
+        caption = caption or str(value.get_label() or "")
+    elif isinstance(value, (str, Path)):
+        uri, mime = _file_uri(value)
+    else:
+        raise ConfigError(f"figures[{name!r}]: expected a matplotlib Figure or a path, received {type(value).__name__}.")
+    text = f"<b>{escape(name)}.</b> {escape(caption)}"
+    return f"<figure>{_media(uri, mime, caption or name)}<figcaption>{text}</figcaption></figure>"
+
+
+def _flatten(config: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
+    rows: list[tuple[str, Any]] = []
+    for key, value in config.items():
+        name = f"{prefix}{key}"
+        if is_dataclass(value) and not isinstance(value, type):
+            value = asdict(value)
+        rows += _flatten(value, f"{name}.") if isinstance(value, Mapping) and value else [(name, value)]
+    return rows
+
+
+def _list(items: Sequence[str]) -> str:
+    return "<ul>" + "".join(f"<li>{escape(str(i))}</li>" for i in items) + "</ul>"
+
+
+def _measured_line(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> list[str]:
+    """The measured side of the verdict: shares of the summary with n and bound."""
+    lines = []
+    for label, value, *_ in rows:
+        m = measurements.get(label, {})
+        if value is not None and not isinstance(value, (int, float, str)) and not hasattr(value, "item"):
+            m = _plain("summary", value)
+        if m.get("n") and m.get("upper") is not None:
+            shown = format_value(m.get("value"), "share")
+            lines.append(f"{label}: {shown} of {m['n']:,} (95 %: {_bound(m)})")
+    return lines
+
+
+def _sizes(checks: Sequence[Any]) -> str:
+    rows = [_plain("checks", c) for c in checks]
+    names = list(dict.fromkeys(k for row in rows for k in row))
+    share = ("size", "returned")
+    cells = [[escape(format_value(r.get(k), "share" if k in share else "")) for k in names] for r in rows]
+    return _table([n.replace("_", " ") for n in names], cells, kind="plain")
+
+
+def write_report(
+    path: str | Path,
+    *,
+    title: str,
+    summary: Sequence[Sequence[Any]] = (),
+    measurements: Mapping[str, Any] | None = None,
+    figures: Mapping[str, Any] | None = None,
+    config: Mapping[str, Any] | None = None,
+    checks: Sequence[Any] = (),
+    certificate_html: str | None = None,
+    video: str | Path | None = None,
+    notes: str = "",
+    proved: Sequence[str] | None = None,
+    assumed: Sequence[str] | None = None,
+) -> Path:
+    """Write a run's report: one HTML file without scripts or outside resources, for desk and phone, light and dark.
+
+    The page begins with the verdict: what is proved, what is measured (with n and a 95 % bound), what is assumed.
+
+    Args:
+        path: file to write; its folder is created.
+        title: what was trained.
+        summary: rows (label, value, must, aim, verdict). A value is a number, or a measurement with ``value``,
+            ``unit``, ``n``, ``events``, ``lower`` and ``upper``; a verdict starts with "aim", "must", "missed" or
+            "not measured". See ``requirement_rows``.
+        measurements: every measurement by name: mapping or dataclass with ``value``, ``unit``, ``n``, ``lower``,
+            ``upper``, ``note``.
+        figures: by name: a matplotlib Figure (its label is the caption), the path of a picture, or (either, caption).
+        config: everything that determined the run, nested; its ``seed`` is named at the top.
+        checks: held-out checks, one mapping or dataclass per round.
+        certificate_html: a certificate's own page or fragment, shown in a frame that may run no scripts.
+        video: mp4, webm or gif file.
+        notes: text, in paragraphs separated by empty lines.
+        proved: statements that are proved; default: the measurements whose note begins with "proved".
+        assumed: what both rest on; default: what holds for every sampled figure.
+
+    Returns:
+        The file.
+
+    Raises:
+        ShapeError: a row of the summary has not five entries.
+        ConfigError: a figure, video, measurement or check is not what was expected.
+
+    Source: none.
+
+    Example:
+        >>> import tempfile
+        >>> folder = tempfile.mkdtemp()
+        >>> page = write_report(folder + "/report.html", title="Demo", summary=[("a", 0.0, "0", "0", "aim")])
+        >>> "All 1 requirements reached" in page.read_text()
+        True
+    """
+    data = {name: _plain(f"measurements[{name!r}]", m) for name, m in (measurements or {}).items()}
+    config = dict(config or {})
+    headline, kind, table = _summary(summary, data)
+    if proved is None:
+        found = [(n, m) for n, m in data.items() if str(m.get("note", "")).startswith("proved")]
+        proved = [f"{n.replace('_', ' ')} = {format_value(m.get('value'))}: {m['note']}" for n, m in found]
+    measured = _measured_line(summary, data)
+    columns = [
+        ("Proved", list(proved) or ["Nothing: every figure of this page is measured."]),
+        ("Measured", measured or ["No share with a confidence bound."]),
+        ("Assumed", list(_ASSUMED if assumed is None else assumed) or ["Nothing stated."]),
+    ]
+    facts = [f"seed {config['seed']}"] if "seed" in config else []
+    facts += [f"preset {config['preset']}"] if "preset" in config else []
+    facts += [f"torchrl_sspl {_version('torchrl-sspl')}", f"torch {_version('torch')}", f"Python {platform.python_version()}"]
+
+    parts = [
+        f"<header><h1>{escape(title)}</h1><p class='facts'>{escape(' \u00b7 '.join(facts))}</p></header>",
+        f'<section class="verdict {kind}"><h2>{_BADGES[kind]} {escape(headline)}</h2><div class="columns">'
+        + "".join(f"<div><h3>{name}</h3>{_list(items)}</div>" for name, items in columns)
+        + "</div></section>",
+    ]
+    if table:
+        parts.append(f"<section><h2>Requirements</h2>{table}</section>")
+    if notes.strip():
+        paragraphs = (escape(p.strip()).replace("\n", "<br>") for p in re.split(r"\n\s*\n", notes.strip()))
+        parts.append("<section><h2>Notes</h2>" + "".join(f"<p>{p}</p>" for p in paragraphs) + "</section>")
+    if video is not None:
+        uri, mime = _file_uri(video)
+        text = "One episode: what the agent sees, the true state, and the barrier value."
+        parts.append(
+            f"<section><h2>Episode</h2><figure>{_media(uri, mime, text)}<figcaption>{text}</figcaption></figure></section>"
+        )
+    if figures:
+        parts.append("<section><h2>Figures</h2>" + "".join(_figure(n, f) for n, f in figures.items()) + "</section>")
+    if certificate_html:
+        parts.append(
+            "<section><h2>Certificate</h2>"
+            f'<iframe sandbox title="Certificate" srcdoc="{escape(certificate_html)}"></iframe></section>'
+        )
+    if checks:
+        parts.append(f"<section><h2>Held-out checks of every round</h2>{_sizes(checks)}</section>")
+    if data:
+        cells = [
+            [
+                f"<code>{escape(n)}</code>",
+                escape(format_value(m.get("value"), m.get("unit", ""))),
+                escape(_bound(m)),
+                escape(_count(m.get("n"))),
+                escape(str(m.get("note", ""))),
+            ]
+            for n, m in data.items()
+        ]
+        body = _table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
+        parts.append(f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>")
+    if config:
+        rows = [[f"<code>{escape(k)}</code>", escape(str(v))] for k, v in _flatten(config)]
+        body = _table(("Key", "Value"), rows, kind="plain")
+        parts.append(f"<section><details><summary>Configuration</summary>{body}</details></section>")
+
+    page = (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        '<meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title><style>{CSS}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
+    )
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"

@@ -1,0 +1,39 @@
+"""Style sheet of the report: one column, light and dark, tables that become cards on a phone."""
+
+CSS = """
+:root{--ink:#1a1f27;--soft:#5b6470;--page:#f6f7f9;--card:#fff;--line:#dde1e7;--good:#13702f;--good-bg:#e3f4e6;
+--fair:#7a5200;--fair-bg:#fdf1d3;--bad:#b3261e;--bad-bg:#fce4e1;--none:#4b5563;--none-bg:#e8ebef}
+@media(prefers-color-scheme:dark){:root{--ink:#e7eaee;--soft:#a3acb8;--page:#12151a;--card:#1b2027;--line:#323a45;
+--good:#7ddb95;--good-bg:#16351f;--fair:#f1c765;--fair-bg:#3b2f10;--bad:#ff9d94;--bad-bg:#451a17;--none:#b6bec9;--none-bg:#2a313b}}
+*{box-sizing:border-box}
+body{margin:0;background:var(--page);color:var(--ink);font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
+main{max-width:1000px;margin:0 auto;padding:24px 16px 64px}
+h1{font-size:1.7rem;line-height:1.2;margin:0}h2{font-size:1.2rem;margin:0 0 .6rem}h3{font-size:.95rem;margin:0 0 .2rem}
+.facts{color:var(--soft);margin:.25rem 0 1rem;font-size:.9rem}
+section{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:18px;margin:0 0 18px;overflow-wrap:anywhere}
+.verdict{border-left:8px solid var(--none)}.verdict h2{font-size:1.45rem;line-height:1.25}
+.verdict.good{border-left-color:var(--good)}.verdict.good h2{color:var(--good)}
+.verdict.bad{border-left-color:var(--bad)}.verdict.bad h2{color:var(--bad)}
+.columns{display:grid;grid-template-columns:repeat(3,1fr);gap:20px;font-size:.92rem}
+ul{margin:0;padding-left:1.1em}li{margin:.15em 0}
+.scroll{overflow-x:auto}
+table{border-collapse:collapse;width:100%;font-size:.9rem;font-variant-numeric:tabular-nums}
+th,td{text-align:left;padding:.4em .6em;border-bottom:1px solid var(--line);vertical-align:top}
+th{color:var(--soft);font-weight:600;white-space:nowrap}tbody tr:last-child td{border-bottom:0}
+code{font-size:.88em}
+.badge{display:inline-block;border-radius:6px;padding:.05em .5em;font-weight:600;background:var(--none-bg);color:var(--none)}
+.badge.good{background:var(--good-bg);color:var(--good)}.badge.fair{background:var(--fair-bg);color:var(--fair)}
+.badge.bad{background:var(--bad-bg);color:var(--bad)}
+figure{margin:0 0 22px}figure:last-child{margin-bottom:0}
+img,video{display:block;max-width:100%;height:auto;margin:0 auto;background:#fff;border-radius:8px}
+figcaption{color:var(--soft);font-size:.9rem;margin-top:.4rem}figcaption b{color:var(--ink)}
+iframe{width:100%;height:min(70vh,640px);border:1px solid var(--line);border-radius:8px;background:#fff;color-scheme:light}
+summary{font-size:1.2rem;font-weight:700;cursor:pointer}details[open] summary{margin-bottom:.6rem}
+@media(max-width:760px){main{padding:14px 8px 40px}section{padding:14px 12px}.columns{grid-template-columns:1fr;gap:12px}
+table.summary thead{display:none}table.summary tr{display:block;padding:.5em 0;border-bottom:1px solid var(--line)}
+table.summary tr:last-child{border-bottom:0}
+table.summary td{display:flex;justify-content:space-between;gap:1em;border:0;padding:.1em 0;text-align:right}
+table.summary td::before{content:attr(data-label);color:var(--soft);text-align:left;flex:none}
+table.summary td:first-child{display:block;text-align:left;font-weight:700}table.summary td:first-child::before{content:none}}
+@media print{body{background:#fff}section{break-inside:avoid}}
+"""
