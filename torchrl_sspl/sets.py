@@ -7,20 +7,78 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sspl.errors import ConfigError, EmptyRegionError, OverlapError, ShapeError
+from torchrl_sspl.errors import ConfigError, EmptyRegionError, NonFiniteError, OverlapError, ShapeError
 
 UNLABELLED, SAFE, UNSAFE = 0, 1, 2
 
+_ATTEMPTS = 1000  # rejection rounds after which a difference counts as empty
+
 
 class Region:
-    """A set of states: membership and uniform samples."""
+    """A set of states: membership and samples.
+
+    Subclass it for sets of your own: give ``dim``, :meth:`contains` and :meth:`sample`.
+
+    Attributes:
+        dim: number of state components.
+
+    Source: paper Section II (the sets S and U).
+
+    Example:
+        >>> class Disc(Region):
+        ...     dim = 2
+        ...     def contains(self, state):
+        ...         return state.norm(dim=-1) <= 1.0
+        ...     def sample(self, n, generator=None, device=None):
+        ...         x = torch.randn(n, 2, generator=generator, device=device)
+        ...         return x / x.norm(dim=-1, keepdim=True) * torch.rand(n, 1, generator=generator, device=device).sqrt()
+        >>> (Box([-2, -2], [2, 2]) - Disc()).contains(torch.tensor([[0.0, 0.5], [0.0, 1.5]]))
+        tensor([False,  True])
+    """
 
     dim: int
 
     def contains(self, state: Tensor) -> Tensor:
+        """Whether states belong to the set.
+
+        Args:
+            state: ``(*batch, dim)``, state units.
+
+        Returns:
+            bool ``(*batch,)``.
+
+        Raises:
+            ShapeError: if the last dimension is not ``dim``.
+            NonFiniteError: if a state is NaN.
+
+        Source: none.
+
+        Example:
+            >>> Box([0.0], [1.0]).contains(torch.tensor([[0.0], [1.0], [1.1]]))
+            tensor([ True,  True, False])
+        """
         raise NotImplementedError
 
-    def sample(self, n: int, generator: torch.Generator | None = None, device=None) -> Tensor:
+    def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Random states of the set.
+
+        Args:
+            n: how many.
+            generator: random numbers, on ``device``.
+            device: where the states go.
+
+        Returns:
+            ``(n, dim)``, float32, state units.
+
+        Raises:
+            EmptyRegionError: if no state is found.
+
+        Source: none.
+
+        Example:
+            >>> Box([0.0], [1.0]).sample(3, torch.Generator().manual_seed(0)).shape
+            torch.Size([3, 1])
+        """
         raise NotImplementedError
 
     def __sub__(self, other: Region) -> Difference:
@@ -31,71 +89,254 @@ class Region:
 
 
 class Box(Region):
-    def __init__(self, low: Sequence[float], high: Sequence[float], period: Sequence[float | None] | None = None) -> None:
-        self.low, self.high = torch.as_tensor(low, dtype=torch.float32), torch.as_tensor(high, dtype=torch.float32)
-        if self.low.shape != self.high.shape or not bool((self.low < self.high).all()):
-            raise ConfigError(f"expected low < high of equal length, received {list(low)} and {list(high)}")
-        self.dim = len(self.low)
-        self.period = torch.tensor([float(p or 0.0) for p in (period or [0.0] * self.dim)])
+    r"""Closed box :math:`\prod_i [l_i, h_i]`; periodic components are compared on the circle.
 
-    def _wrap(self, state: Tensor) -> Tensor:
-        p = self.period.to(state)
-        safe = torch.where(p > 0, p, 1.0)
-        return torch.where(p > 0, torch.remainder(state + safe / 2, safe) - safe / 2, state)
+    Args:
+        low: lower corner.
+        high: upper corner, larger in every component.
+        period: period of every component, None or 0 where there is none.
+
+    Raises:
+        ConfigError: if the corners are not finite and in order, or a period is negative or of another length.
+
+    Source: none.
+
+    Example:
+        >>> from math import pi
+        >>> circle = Box([-pi], [pi], period=[2 * pi])
+        >>> circle.contains(torch.tensor([[-pi], [pi], [3 * pi], [100.0]]))
+        tensor([True, True, True, True])
+    """
+
+    def __init__(
+        self, low: Sequence[float], high: Sequence[float], period: Sequence[float | None] | None = None
+    ) -> None:
+        self.low, self.high = torch.as_tensor(low, dtype=torch.float32), torch.as_tensor(high, dtype=torch.float32)
+        finite = bool(self.low.isfinite().all() & self.high.isfinite().all())
+        if self.low.ndim != 1 or self.low.shape != self.high.shape or not finite or not bool((self.low < self.high).all()):
+            raise ConfigError(f"expected low < high, finite and of equal length, received {low} and {high}")
+        self.dim = len(self.low)
+        periods = [float(p or 0.0) for p in (period if period is not None else [0.0] * self.dim)]
+        if len(periods) != self.dim or not all(0.0 <= p < float("inf") for p in periods):
+            raise ConfigError(f"expected one period >= 0 (or None) for each of {self.dim} components, received {period}")
+        self.period = torch.tensor(periods)
 
     def contains(self, state: Tensor) -> Tensor:
-        if state.shape[-1] != self.dim:
-            raise ShapeError(f"expected states of shape (*batch, {self.dim}), received {tuple(state.shape)}")
-        x = self._wrap(state)
-        return ((x >= self.low.to(x)) & (x <= self.high.to(x))).all(-1)
+        """Whether states lie in the box, borders included; arguments as for :meth:`Region.contains`.
 
-    def sample(self, n: int, generator: torch.Generator | None = None, device=None) -> Tensor:
+        Example:
+            >>> Box([0.0, 0.0], [1.0, 2.0]).contains(torch.tensor([[0.5, 2.0], [0.5, 2.1]]))
+            tensor([ True, False])
+        """
+        _check_states(state, self.dim)
+        low, high, period = (t.to(state) for t in (self.low, self.high, self.period))
+        inside = (state >= low) & (state <= high)
+        # On the circle: how far the state lies above the lower corner. A whole turn less one rounding error is the
+        # lower corner itself, and so is a state that equals it up to float32.
+        turn = torch.where(period > 0, period, 1.0)
+        above = torch.remainder(state - low, turn)
+        rounding = 4e-7 * (turn + state.abs())
+        around = (above <= high - low + rounding) | (above >= turn - rounding)
+        return torch.where(period > 0, around, inside).all(-1)
+
+    def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Uniform states of the box; arguments as for :meth:`Region.sample`.
+
+        Example:
+            >>> box = Box([0.0, 5.0], [1.0, 6.0])
+            >>> bool(box.contains(box.sample(100)).all())
+            True
+        """
         u = torch.rand(n, self.dim, generator=generator, device=device)
         return self.low.to(u) + u * (self.high - self.low).to(u)
 
     def grid(self, n: int | Sequence[int]) -> Tensor:
+        """Regular grid over the box, corners included.
+
+        Args:
+            n: points per component, one number or one for each.
+
+        Returns:
+            ``(prod(n), dim)``, float32, last component fastest.
+
+        Raises:
+            ConfigError: if the number of sizes is not ``dim``, or one is below 1.
+
+        Source: none.
+
+        Example:
+            >>> Box([0.0, 0.0], [1.0, 2.0]).grid(2).tolist()
+            [[0.0, 0.0], [0.0, 2.0], [1.0, 0.0], [1.0, 2.0]]
+        """
         sizes = [n] * self.dim if isinstance(n, int) else list(n)
+        if len(sizes) != self.dim or min(sizes) < 1:
+            raise ConfigError(f"expected {self.dim} sizes >= 1, received {sizes}; pass one number or one per component")
         axes = [torch.linspace(float(a), float(b), k) for a, b, k in zip(self.low, self.high, sizes, strict=True)]
         return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, self.dim)
 
 
 class Difference(Region):
+    r"""States of one set that are not in another, :math:`A \setminus B`; also ``a - b``.
+
+    Args:
+        a: the set A.
+        b: the set B, of the same dimension.
+
+    Raises:
+        ShapeError: if the dimensions differ.
+
+    Source: paper Section V (unsafe: the space without a box).
+
+    Example:
+        >>> ring = Difference(Box([-2.0], [2.0]), Box([-1.0], [1.0]))
+        >>> ring.contains(torch.tensor([[0.0], [1.5], [3.0]]))
+        tensor([False,  True, False])
+    """
+
     def __init__(self, a: Region, b: Region) -> None:
-        self.a, self.b, self.dim = a, b, a.dim
+        self.a, self.b, self.dim = a, b, _common_dim(a, b)
 
     def contains(self, state: Tensor) -> Tensor:
+        """Whether states are in A and not in B; arguments as for :meth:`Region.contains`.
+
+        Example:
+            >>> (Box([0.0], [2.0]) - Box([0.0], [1.0])).contains(torch.tensor([[1.0], [1.5]]))
+            tensor([False,  True])
+        """
         return self.a.contains(state) & ~self.b.contains(state)
 
-    def sample(self, n: int, generator: torch.Generator | None = None, device=None) -> Tensor:
+    def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Samples of A without those in B; arguments as for :meth:`Region.sample`.
+
+        Raises:
+            EmptyRegionError: if (almost) every sample of A is in B.
+
+        Example:
+            >>> ring = Box([-2.0], [2.0]) - Box([-1.0], [1.0])
+            >>> bool((ring.sample(100).abs() > 1.0).all())
+            True
+        """
         parts, found = [], 0
-        for _ in range(1000):
+        for _ in range(_ATTEMPTS):
             x = self.a.sample(max(2 * n, 64), generator, device)
             x = x[~self.b.contains(x)]
             parts.append(x)
             found += len(x)
             if found >= n:
                 return torch.cat(parts)[:n]
-        raise EmptyRegionError("expected a difference with positive volume, received (almost) nothing; check the sets")
+        raise EmptyRegionError(
+            f"expected a difference with positive volume, received {found} states in {_ATTEMPTS} attempts to draw {n}; "
+            "make the first set larger or the second smaller"
+        )
 
 
 class Union(Region):
+    r"""States of any of several sets, :math:`\bigcup_i A_i`; also ``a | b``.
+
+    Args:
+        *parts: the sets, of the same dimension.
+
+    Raises:
+        ConfigError: if there are none.
+        ShapeError: if the dimensions differ.
+
+    Source: none.
+
+    Example:
+        >>> (Box([0.0], [1.0]) | Box([2.0], [3.0])).contains(torch.tensor([[0.5], [1.5], [2.5]]))
+        tensor([ True, False,  True])
+    """
+
     def __init__(self, *parts: Region) -> None:
-        self.parts, self.dim = parts, parts[0].dim
+        if not parts:
+            raise ConfigError("expected at least one set to unite, received none; pass the sets as arguments")
+        self.parts, self.dim = parts, _common_dim(*parts)
 
     def contains(self, state: Tensor) -> Tensor:
+        """Whether states are in any of the sets; arguments as for :meth:`Region.contains`.
+
+        Example:
+            >>> Union(Box([0.0], [1.0])).contains(torch.tensor([0.5]))
+            tensor(True)
+        """
         return torch.stack([p.contains(state) for p in self.parts]).any(0)
 
-    def sample(self, n: int, generator: torch.Generator | None = None, device=None) -> Tensor:
+    def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Samples in equal shares from the parts, grouped by part; arguments as for :meth:`Region.sample`.
+
+        Example:
+            >>> union = Box([0.0], [1.0]) | Box([2.0], [3.0])
+            >>> bool(union.contains(union.sample(100)).all())
+            True
+        """
         which = torch.randint(len(self.parts), (n,), generator=generator, device=device)
         return torch.cat([p.sample(int((which == k).sum()), generator, device) for k, p in enumerate(self.parts)])
 
 
 def label(state: Tensor, safe: Region, unsafe: Region) -> Tensor:
+    """Region codes of states: 0 unlabelled, 1 safe, 2 unsafe (unsafe wins where both claim a state).
+
+    Args:
+        state: ``(*batch, dim)``, state units.
+        safe: the set S.
+        unsafe: the set U.
+
+    Returns:
+        int64 ``(*batch, 1)``.
+
+    Raises:
+        ShapeError: if the last dimension is not that of the sets.
+        NonFiniteError: if a state is NaN.
+
+    Source: paper Section III (the labelled data).
+
+    Example:
+        >>> label(torch.tensor([[0.5], [1.5], [2.5]]), Box([0.0], [1.0]), Box([2.0], [3.0])).flatten()
+        tensor([1, 0, 2])
+    """
     codes = torch.where(safe.contains(state), SAFE, UNLABELLED)
     return torch.where(unsafe.contains(state), UNSAFE, codes).unsqueeze(-1)
 
 
 def check_disjoint(safe: Region, unsafe: Region, n: int = 4096) -> None:
-    g = torch.Generator().manual_seed(0)
-    if bool(unsafe.contains(safe.sample(n, g)).any()) or bool(safe.contains(unsafe.sample(n, g)).any()):
-        raise OverlapError("expected disjoint safe and unsafe sets, received sets that share states; change one of them")
+    """Raises if a sample of one set belongs to the other: a check by samples, not a proof.
+
+    Args:
+        safe: the set S.
+        unsafe: the set U.
+        n: samples of each set.
+
+    Raises:
+        OverlapError: if the sets share a sample.
+        EmptyRegionError: if a set has (almost) no volume.
+
+    Source: none.
+
+    Example:
+        >>> check_disjoint(Box([0.0], [1.0]), Box([2.0], [3.0]))
+    """
+    generator = torch.Generator().manual_seed(0)
+    shared = int(unsafe.contains(safe.sample(n, generator)).sum()), int(safe.contains(unsafe.sample(n, generator)).sum())
+    if any(shared):
+        raise OverlapError(
+            f"expected disjoint safe and unsafe sets, received {shared[0]} of {n} safe samples in the unsafe set and "
+            f"{shared[1]} of {n} unsafe samples in the safe set; change one of them"
+        )
+
+
+def _check_states(state: Tensor, dim: int) -> None:
+    if state.ndim < 1 or state.shape[-1] != dim:
+        raise ShapeError(
+            f"expected states of shape (*batch, {dim}), received {tuple(state.shape)}; the last dimension holds the state"
+        )
+    if bool(state.isnan().any()):
+        raise NonFiniteError(
+            f"expected states without NaN, received {int(state.isnan().sum())} of {state.numel()} values NaN; check the "
+            "dynamics or the action that led there"
+        )
+
+
+def _common_dim(*parts: Region) -> int:
+    if len({p.dim for p in parts}) > 1:
+        raise ShapeError(f"expected sets of one dimension, received dimensions {[p.dim for p in parts]}")
+    return parts[0].dim
