@@ -404,6 +404,35 @@ class LatentLoss(LossModule):
             batch.weights = None if weights is None else _batch_last(weights, batch.shape)
         return batch
 
+    @torch.no_grad()
+    def latents(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
+        """Online latents of a batch of transitions, without gradient.
+
+        Args:
+            tensordict: batch with observations (or frames, or latents) of two successive steps.
+
+        Returns:
+            Latent and next latent, each ``(*batch, p)``.
+
+        Raises:
+            ConfigError: if an entry is missing.
+        """
+        now, after = self._encode(tensordict, None, True, True, "online")
+        return now, after
+
+    @torch.no_grad()
+    def predict(self, latent: Tensor, action: Tensor) -> Tensor:
+        """Next latent by the online dynamics, without gradient.
+
+        Args:
+            latent: ``(*batch, p)``.
+            action: ``(*batch, action_dim)`` in physical units.
+
+        Returns:
+            ``(*batch, p)``.
+        """
+        return self._run("dynamics", latent, action)
+
     # ------------------------------------------------------------------ output
 
     def _reduce(

@@ -1,0 +1,261 @@
+"""Hooks of the TorchRL trainer: margins, seeds, evaluation, stop on a certificate, figures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor
+from torchrl.data import ReplayBuffer
+from torchrl.trainers import Trainer, TrainerHookBase
+
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.functional import covering_radius, dynamics_error, dynamics_margin, safety_margin
+from torchrl_sspl.objectives import SSPLLoss
+
+MARGINS = ("safety_margin", "dynamics_margin")
+
+
+class MarginHook(TrainerHookBase):
+    r"""Re-estimates the margins before the steps of every collected batch.
+
+    .. math:: \psi \leftarrow L_B \bar\epsilon, \qquad \eta \leftarrow L_B \delta
+
+    with the covering radius :math:`\bar\epsilon` of one half of a sample of latents by the other, and
+    :math:`\delta` the chosen quantile of the latent prediction error on the sample.
+
+    Args:
+        loss: the loss whose buffers are set.
+        replay_buffer: where the sample comes from.
+        lipschitz_bound: :math:`L_B`.
+        update: which margins are set; the others are estimated and logged only.
+        samples: transitions in the sample.
+        quantile: quantile of both estimates, 1 for the maximum (paper).
+        maximum: largest margin that is set, in units of the barrier; early estimates can be larger
+            than anything that a barrier can satisfy.
+
+    Raises:
+        ConfigError: if an argument is not valid.
+
+    Source: paper, Algorithm 1, with eq. (6) and (11).
+
+    Example:
+        >>> MarginHook(None, None, lipschitz_bound=2.0, update=("psi",))
+        Traceback (most recent call last):
+        ...
+        torchrl_sspl.errors.ConfigError: expected update among ('safety_margin', 'dynamics_margin'),
+        received ('psi',)
+    """
+
+    def __init__(
+        self,
+        loss: SSPLLoss,
+        replay_buffer: ReplayBuffer,
+        *,
+        lipschitz_bound: float,
+        update: tuple[str, ...] = MARGINS,
+        samples: int = 512,
+        quantile: float = 1.0,
+        maximum: float = float("inf"),
+    ) -> None:
+        if isinstance(update, str) or not set(update) <= set(MARGINS):
+            raise ConfigError(f"expected update among {MARGINS}, received {update!r}")
+        if samples < 4 or not 0.0 < quantile <= 1.0 or not lipschitz_bound > 0.0 or not maximum > 0.0:
+            raise ConfigError(
+                f"expected samples >= 4, quantile in (0, 1], lipschitz_bound > 0 and maximum > 0, received {samples}, "
+                f"{quantile}, {lipschitz_bound} and {maximum}"
+            )
+        self.loss, self.replay_buffer, self.update = loss, replay_buffer, tuple(update)
+        self.lipschitz_bound, self.samples = float(lipschitz_bound), samples
+        self.quantile, self.maximum = float(quantile), float(maximum)
+        self.last: dict[str, float] = {}
+
+    @torch.no_grad()
+    def __call__(self) -> None:
+        """Estimates and sets the margins."""
+        parts: list[tuple[Tensor, ...]] = []
+        missing = self.samples
+        while missing > 0:
+            batch = self.replay_buffer.sample().to(self.loss.safety_margin.device)
+            action = batch.get(self.loss.tensor_keys.action)
+            parts.append((*self.loss.latents(batch), action))
+            missing -= len(action)
+        latent, after, action = (torch.cat(part)[: self.samples] for part in zip(*parts, strict=True))
+        half = len(latent) // 2
+        radius = covering_radius(latent[:half], latent[half:], quantile=self.quantile)
+        error = dynamics_error(self.loss.predict(latent, action), after)
+        delta = float(error.quantile(self.quantile))
+        estimate = {
+            "safety_margin": safety_margin(self.lipschitz_bound, radius, mode="paper").q1,
+            "dynamics_margin": dynamics_margin(self.lipschitz_bound, delta),
+        }
+        for name in self.update:
+            setattr(self.loss, name, min(estimate[name], self.maximum))
+        self.last = {
+            "covering_radius": radius,
+            "dynamics_error_sample": delta,
+            "safety_margin": float(self.loss.safety_margin),
+            "dynamics_margin": float(self.loss.dynamics_margin),
+        }
+
+    def log(self, batch: TensorDictBase | None) -> dict[str, Any] | None:
+        """Radius, error and margins in force."""
+        return {**self.last, "log_pbar": False} if self.last else None
+
+    def state_dict(self) -> dict[str, Any]:
+        """The last estimates; the margins themselves are buffers of the loss."""
+        return {"last": dict(self.last)}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self.last = dict(state_dict["last"])
+
+    def register(self, trainer: Trainer, name: str = "margins") -> None:
+        """Attaches the hook to ``pre_optim_steps`` and ``post_steps_log``."""
+        trainer.register_op("pre_optim_steps", self)
+        trainer.register_op("post_steps_log", self.log)
+        trainer.register_module(name, self)
+
+
+class SeedHook(TrainerHookBase):
+    """Gives the environments a new seed, drawn from torch's generator, before every collected batch.
+
+    A checkpoint cannot hold the inner state of an arbitrary environment. With this seed and with a
+    collector that resets at each iteration, what a batch holds depends on nothing else than what the
+    checkpoint does hold.
+
+    Args:
+        collector: the collector whose environments are seeded.
+
+    Source: none.
+
+    Example:
+        >>> SeedHook(None).state_dict()
+        {'seed': -1}
+    """
+
+    def __init__(self, collector: Any) -> None:
+        self.collector, self.seed = collector, -1
+
+    def setup(self) -> None:
+        """Seeds the first batch of a run: anew, or as the interrupted run would have."""
+        if self.seed < 0:
+            self()
+        else:
+            self.collector.set_seed(self.seed)
+
+    def __call__(self) -> None:
+        """Draws and sets the seed of the next batch."""
+        self.seed = int(torch.randint(2**31 - 1, (), dtype=torch.int64))
+        self.collector.set_seed(self.seed)
+
+    def state_dict(self) -> dict[str, int]:
+        """The seed of the next batch."""
+        return {"seed": self.seed}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self.seed = int(state_dict["seed"])
+
+    def register(self, trainer: Trainer, name: str = "seeds") -> None:
+        """Attaches the hook to ``setup`` and ``post_steps``."""
+        trainer.register_op("setup", self.setup)
+        trainer.register_op("post_steps", self)
+        trainer.register_module(name, self)
+
+
+class EveryHook(TrainerHookBase):
+    """Runs something every so many collected batches, on frozen networks, and logs what it returns.
+
+    Args:
+        trainer: the trainer.
+        call: ``trainer -> mapping of floats``. With the entry ``"stop"`` (a text, or ``None``) it can end the
+            training: the certificate holds, the figures are reached.
+        every: collected batches between two calls.
+        names: the keys that ``call`` returns, ``"stop"`` apart; with them a result with others is an error.
+
+    Raises:
+        ConfigError: if ``every`` is not positive, or the keys are others than ``names``.
+
+    Source: paper, Algorithm 1 (stop rule); deviation: the printed rule, a total loss of zero, is never met.
+
+    Example:
+        >>> EveryHook(None, lambda trainer: {}, every=5).state_dict()
+        {'count': 0}
+    """
+
+    def __init__(
+        self,
+        trainer: Any,
+        call: Callable[[Any], Mapping[str, Any]],
+        *,
+        every: int = 1,
+        names: tuple[str, ...] | None = None,
+    ) -> None:
+        if every < 1:
+            raise ConfigError(f"expected every >= 1 batches, received {every}")
+        self.trainer, self.call, self.every, self.names, self.count = trainer, call, every, names, 0
+
+    def __call__(self, batch: TensorDictBase | None) -> dict[str, Any] | None:
+        """Counts, and runs when it is time."""
+        self.count += 1
+        if self.count % self.every:
+            return None
+        # Whatever is measured must not change what is trained.
+        with torch.no_grad(), torch.random.fork_rng():
+            result = dict(self.call(self.trainer))
+        reason = result.pop("stop", None)
+        if self.names is not None and set(result) != set(self.names):
+            raise ConfigError(f"expected the keys {sorted(self.names)}, received {sorted(result)}")
+        if reason is not None:
+            self.trainer.request_stop(str(reason))
+        return {**result, "log_pbar": False} if result else None
+
+    def state_dict(self) -> dict[str, int]:
+        """The number of batches seen."""
+        return {"count": self.count}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self.count = int(state_dict["count"])
+
+    def register(self, trainer: Trainer, name: str = "every") -> None:
+        """Attaches the hook to ``post_steps_log``."""
+        trainer.register_op("post_steps_log", self)
+        trainer.register_module(name, self)
+
+
+def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
+    """Gives a matplotlib figure to a TorchRL logger, as far as that kind of logger can take one.
+
+    Args:
+        logger: a wandb, tensorboard or csv logger; the latter keeps a png file beside its scalars.
+        name: name of the figure.
+        figure: matplotlib figure.
+        step: collected frames.
+
+    Returns:
+        The file that was written, if any.
+
+    Source: none.
+
+    Example:
+        >>> log_figure(None, "latent", None, 0) is None
+        True
+    """
+    experiment: Any = getattr(logger, "experiment", None)
+    if hasattr(experiment, "add_figure"):  # tensorboard
+        experiment.add_figure(name, figure, global_step=step)
+    elif type(logger).__name__ == "WandbLogger":
+        import wandb
+
+        experiment.log({name: wandb.Image(figure)})
+    elif getattr(logger, "log_dir", None) is not None:
+        folder = Path(logger.log_dir) / logger.exp_name / "figures"
+        folder.mkdir(parents=True, exist_ok=True)
+        figure.savefig(folder / f"{name}_{step}.png")
+        return folder / f"{name}_{step}.png"
+    return None

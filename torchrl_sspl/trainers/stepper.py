@@ -1,0 +1,176 @@
+"""One training step: the total loss, then the separate step of the Lipschitz loss."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor, nn
+from torchrl.trainers import OptimizationStepper, Trainer
+
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.objectives import LipschitzLoss
+
+#: Terms of the world model, which alone are trained during the warm start.
+WARM_TERMS = frozenset(
+    f"loss_{name}"
+    for name in (
+        "safe",
+        "unsafe",
+        "consistency",
+        "inverse_dynamics",
+        "variance",
+        "covariance",
+        "saturation",
+    )
+)
+
+
+class SSPLStepper(OptimizationStepper):
+    r"""Steps of Algorithm 1: on the total loss, then on :math:`L_M` where the barrier needs it.
+
+    During the warm start only the terms of :math:`L_{SaLaD}` count. With a
+    :class:`~torchrl_sspl.objectives.LipschitzLoss` both steps are followed by a backtracking that
+    keeps the barrier inside the cone in which its bound is certified.
+
+    Args:
+        optimizer: optimiser of the total loss.
+        warm_start_steps: steps on the world model alone.
+        lipschitz_loss: :math:`L_M`, for an :class:`~torchrl_sspl.lipschitz.LMIBarrier`; ``None`` for
+            barriers that are Lipschitz by construction.
+        lipschitz_optimizer: optimiser of :math:`L_M`; needed with ``lipschitz_loss``.
+        autocast: dtype of mixed precision, such as ``torch.bfloat16``; ``None`` for none.
+
+    Returns:
+        ``step`` returns the detached terms and metrics of the losses, ``grad_norm``, ``warm_start`` (1
+        during it) and, with ``lipschitz_loss``, ``lipschitz_share`` (of the last :math:`L_M` step that
+        was kept). The keys do not vary.
+
+    Raises:
+        ConfigError: if only one of ``lipschitz_loss`` and ``lipschitz_optimizer`` is given, or the
+            number of steps is negative.
+
+    Source: paper, Algorithm 1; deviation: the steps never leave the cone.
+
+    Example:
+        >>> weight = nn.Parameter(torch.zeros(1))
+        >>> SSPLStepper(torch.optim.SGD([weight], 0.1), warm_start_steps=10).state_dict()["count"]
+        0
+    """
+
+    def __init__(
+        self,
+        optimizer: torch.optim.Optimizer,
+        *,
+        warm_start_steps: int = 0,
+        lipschitz_loss: LipschitzLoss | None = None,
+        lipschitz_optimizer: torch.optim.Optimizer | None = None,
+        autocast: torch.dtype | None = None,
+    ) -> None:
+        if (lipschitz_loss is None) != (lipschitz_optimizer is None):
+            raise ConfigError(
+                "expected lipschitz_loss and lipschitz_optimizer together, received one of them; give both for an "
+                "LMIBarrier, none for a sandwich barrier"
+            )
+        if warm_start_steps < 0:
+            raise ConfigError(f"expected warm_start_steps >= 0, received {warm_start_steps}")
+        self.optimizer, self.lipschitz_optimizer = optimizer, lipschitz_optimizer
+        self.lipschitz_loss = lipschitz_loss
+        self.warm_start_steps, self.autocast, self.count = warm_start_steps, autocast, 0
+
+    def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
+        """One step on a batch of transitions.
+
+        Args:
+            trainer: the trainer that runs it; gives loss module and clipping.
+            sub_batch: batch of transitions.
+
+        Returns:
+            Detached scalars.
+        """
+        warm = self.count < self.warm_start_steps
+        self.count += 1
+        device = self.optimizer.param_groups[0]["params"][0].device.type
+        with torch.autocast(device, dtype=self.autocast, enabled=self.autocast is not None):
+            terms = trainer.compute_loss(sub_batch)
+            counted = [v for k, v in terms.items() if k.startswith("loss_") and (not warm or k in WARM_TERMS)]
+            total: Tensor = sum(counted)  # type: ignore[assignment]
+        self.optimizer.zero_grad()
+        total.backward()
+        norm = self._clip(trainer)
+        before = self._barrier_state()
+        self.optimizer.step()
+        self._backtrack(before)
+        output = dict(terms.detach().items())
+        output["grad_norm"] = norm.detach()
+        output["warm_start"] = torch.tensor(float(warm))
+        output |= self._lipschitz_step()
+        return TensorDict(output, batch_size=[])
+
+    def _clip(self, trainer: Trainer) -> Tensor:
+        parameters = [
+            p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None
+        ]
+        limit = trainer.clip_norm
+        if limit is not None and not trainer.clip_grad_norm:
+            nn.utils.clip_grad_value_(parameters, limit)
+            limit = None
+        return nn.utils.clip_grad_norm_(parameters, float("inf") if limit is None else limit)
+
+    def _barrier(self) -> Any:
+        assert self.lipschitz_loss is not None
+        network = self.lipschitz_loss.barrier
+        return getattr(network, "module", network)
+
+    def _barrier_state(self) -> dict[str, Tensor]:
+        if self.lipschitz_loss is None:
+            return {}
+        return {name: value.clone() for name, value in self._barrier().state_dict().items()}
+
+    def _backtrack(self, before: dict[str, Tensor]) -> float:
+        return self._barrier().backtracking_step(before) if before else 1.0
+
+    def _lipschitz_step(self) -> dict[str, Tensor]:
+        if self.lipschitz_loss is None or self.lipschitz_optimizer is None:
+            return {}
+        terms = self.lipschitz_loss(TensorDict(batch_size=[]))
+        self.lipschitz_optimizer.zero_grad()
+        terms["loss_lipschitz"].backward()
+        before = self._barrier_state()
+        self.lipschitz_optimizer.step()
+        share = self._backtrack(before)
+        return {**dict(terms.detach().items()), "lipschitz_share": torch.tensor(share)}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Counter and both optimisers."""
+        state: dict[str, Any] = {"count": self.count, "optimizer": self.optimizer.state_dict()}
+        if self.lipschitz_optimizer is not None:
+            state["lipschitz_optimizer"] = self.lipschitz_optimizer.state_dict()
+        return state
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self.count = int(state_dict["count"])
+        self.optimizer.load_state_dict(state_dict["optimizer"])
+        if self.lipschitz_optimizer is not None:
+            self.lipschitz_optimizer.load_state_dict(state_dict["lipschitz_optimizer"])
+
+
+def learnable(modules: Iterable[nn.Module]) -> list[nn.Parameter]:
+    """Trainable parameters of several modules, each once.
+
+    Args:
+        modules: networks or losses, which may share parameters.
+
+    Returns:
+        The parameters in the order in which they are met.
+
+    Example:
+        >>> layer = nn.Linear(2, 1)
+        >>> len(learnable([layer, layer]))
+        2
+    """
+    found = {id(p): p for module in modules for p in module.parameters() if p.requires_grad}
+    return list(found.values())

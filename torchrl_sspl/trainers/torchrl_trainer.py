@@ -1,0 +1,206 @@
+"""TorchRL's trainer for the total loss: stepper, margins, seeds, checks and checkpoints in place."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModuleBase
+from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
+from torchrl.data import ReplayBuffer
+from torchrl.objectives import SoftUpdate, TargetNetUpdater
+from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer, UpdateWeights
+
+from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.modules import make_rollout_policy
+from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
+from torchrl_sspl.trainers.hooks import EveryHook, MarginHook, SeedHook, log_figure
+from torchrl_sspl.trainers.stepper import SSPLStepper
+
+Call = Callable[["SSPLTrainer"], Mapping[str, Any]]
+
+
+class SSPLTrainer(Trainer):
+    r"""Algorithm 1 on TorchRL's trainer.
+
+    Per collected batch: store it; re-estimate the margins; ``optim_steps_per_batch`` steps on the
+    total loss (and on :math:`L_M` where the barrier needs it), each followed by the target-network
+    update; hand the new weights to the collector; evaluate, draw, check whether to stop; save. With
+    ``checkpoint_dir`` a run that was killed at any moment continues from its last complete checkpoint
+    through :meth:`resume`, and on one CPU process ends with the very weights of a run that was never
+    killed, if the collector resets at each iteration (``reset_at_each_iter=True``).
+
+    Args:
+        collector: TorchRL collector.
+        total_frames: transitions to collect.
+        loss_module: the total loss.
+        optimizer: optimiser of the total loss.
+        replay_buffer: where transitions go and batches come from, such as ``TransitionStore.replay_buffer``.
+        optim_steps_per_batch: steps per collected batch.
+        frame_skip: environment steps per transition.
+        warm_start_steps: steps on the world model alone, before everything else counts.
+        target_net_updater: updater of :math:`\theta^-`; needed if and only if the loss has delayed networks.
+            ``None`` gives ``SoftUpdate(loss_module, tau=0.01)`` then.
+        lipschitz_loss: :math:`L_M`, for an ``LMIBarrier``.
+        lipschitz_optimizer: its optimiser.
+        margins: re-estimates the margins; ``None`` keeps those of the loss.
+        rollout_policy: policy of the collector in other processes; by default encoder and policy of the loss.
+        evaluate: ``trainer -> mapping of floats``, logged; the entry ``"stop"`` (a text) ends the training.
+        evaluate_every: collected batches between evaluations.
+        draw: ``trainer -> mapping of names to figures``, given to the logger.
+        draw_every: collected batches between drawings.
+        checkpoint_dir: folder of the checkpoints; ``None`` for none.
+        checkpoint_every: collected transitions between checkpoints; 0 saves after every batch.
+        keep_checkpoints: number of checkpoints that are kept.
+        autocast: dtype of mixed precision.
+        **trainer_options: further arguments of ``torchrl.trainers.Trainer``, such as ``logger``,
+            ``clip_norm``, ``progress_bar``, ``log_interval``, ``seed``.
+
+    Raises:
+        ConfigError: if the loss is no ``SSPLLoss``, or arguments do not go together.
+
+    Source: paper, Algorithm 1; deviations: see the loss and the hooks.
+
+    Example:
+        >>> from torchrl.collectors import Collector
+        >>> from torchrl_sspl.data import TransitionStore
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> from torchrl_sspl.modules import Policy, SaLaD
+        >>> _ = torch.manual_seed(0)
+        >>> env = PendulumEnv(batch_size=[4], image_size=16, seed=0)
+        >>> env.initial_set = env.safe_set | env.unsafe_set
+        >>> salad = SaLaD.from_sizes(2, 1, action_scale=env.max_action, pool_to=8)
+        >>> policy = Policy(2, 1, action_scale=env.max_action)
+        >>> loss = SSPLLoss(*salad, policy)
+        >>> options = {"reset_at_each_iter": True, "auto_register_policy_transforms": False}
+        >>> collector = Collector(env, make_rollout_policy(salad, policy), frames_per_batch=64,
+        ...                       total_frames=128, **options)
+        >>> trainer = SSPLTrainer(collector=collector, total_frames=128, loss_module=loss,
+        ...                       optimizer=torch.optim.Adam(loss.parameters(), 1e-3),
+        ...                       replay_buffer=TransitionStore(256).replay_buffer(16),
+        ...                       optim_steps_per_batch=2, progress_bar=False)
+        >>> trainer.train()
+        >>> trainer.collected_frames
+        128
+    """
+
+    def __init__(
+        self,
+        *,
+        collector: Any,
+        total_frames: int,
+        loss_module: SSPLLoss,
+        optimizer: torch.optim.Optimizer,
+        replay_buffer: ReplayBuffer,
+        optim_steps_per_batch: int,
+        frame_skip: int = 1,
+        warm_start_steps: int = 0,
+        target_net_updater: TargetNetUpdater | None = None,
+        lipschitz_loss: LipschitzLoss | None = None,
+        lipschitz_optimizer: torch.optim.Optimizer | None = None,
+        margins: MarginHook | None = None,
+        rollout_policy: TensorDictModuleBase | None = None,
+        evaluate: Call | None = None,
+        evaluate_every: int = 1,
+        draw: Call | None = None,
+        draw_every: int = 1,
+        checkpoint_dir: str | os.PathLike[str] | None = None,
+        checkpoint_every: int = 0,
+        keep_checkpoints: int = 2,
+        autocast: torch.dtype | None = None,
+        **trainer_options: Any,
+    ) -> None:
+        if not isinstance(loss_module, SSPLLoss):
+            raise ConfigError(
+                f"expected loss_module to be an SSPLLoss, received {type(loss_module).__name__}"
+            )
+        delayed = any(name.startswith("target_") for name, _ in loss_module.named_children())
+        if target_net_updater is not None and not delayed:
+            raise ConfigError(
+                "expected no target_net_updater for a loss without delayed networks, received "
+                f"{type(target_net_updater).__name__}; choose consistency='target' or successor='target', or leave it out"
+            )
+        if delayed and target_net_updater is None:
+            target_net_updater = SoftUpdate(loss_module, tau=0.01)
+        stepper = SSPLStepper(
+            optimizer,
+            warm_start_steps=warm_start_steps,
+            lipschitz_loss=lipschitz_loss,
+            lipschitz_optimizer=lipschitz_optimizer,
+            autocast=autocast,
+        )
+        if checkpoint_dir is not None:
+            trainer_options |= {
+                # In name order the generator comes after what might draw from it, the collector.
+                "checkpoint": Checkpoint(rng=GlobalRNGState()),
+                "checkpoint_rotation": CheckpointRotation(checkpoint_dir, keep_last=keep_checkpoints),
+                # TorchRL saves when more than this number was collected.
+                "save_trainer_interval": checkpoint_every - 1,
+            }
+        super().__init__(
+            collector=collector,
+            total_frames=total_frames,
+            frame_skip=frame_skip,
+            optim_steps_per_batch=optim_steps_per_batch,
+            loss_module=loss_module,
+            optimization_stepper=stepper,
+            replay_buffer=replay_buffer,
+            target_net_updater=target_net_updater,
+            **trainer_options,
+        )
+        replay = ReplayBufferTrainer(replay_buffer, flatten_tensordicts=True)
+        self.register_op("batch_process", replay.extend)
+        self.register_op("process_optim_batch", replay.sample)
+        self.register_module("replay_buffer", replay)
+        if target_net_updater is not None:
+            self.register_op("post_optim", TargetNetUpdaterHook(target_net_updater))
+        if rollout_policy is None and loss_module.encoder is not None:
+            rollout_policy = make_rollout_policy(loss_module.encoder, loss_module.actor_network)
+        if rollout_policy is not None:
+            weights = partial(TensorDict.from_module, rollout_policy)
+            self.register_op("post_steps", UpdateWeights(collector, 1, policy_weights_getter=weights))
+        if margins is not None:
+            margins.register(self)
+        SeedHook(collector).register(self)
+        if evaluate is not None:
+            EveryHook(self, evaluate, every=evaluate_every).register(self, "evaluate")
+        if draw is not None:
+            EveryHook(self, partial(self._draw, draw), every=draw_every).register(self, "draw")
+
+    @staticmethod
+    def _draw(draw: Call, trainer: SSPLTrainer) -> dict[str, Any]:
+        for name, figure in draw(trainer).items():
+            log_figure(trainer.logger, name, figure, trainer.collected_frames)
+        return {}
+
+    def resume(self) -> bool:
+        """Continues from the newest complete checkpoint, if there is one.
+
+        Returns:
+            Whether there was one.
+
+        Raises:
+            ConfigError: if the trainer has no ``checkpoint_dir``.
+            CheckpointError: if the checkpoint cannot be read or does not fit.
+        """
+        rotation = self.checkpoint_rotation
+        if rotation is None:
+            raise ConfigError(
+                "expected a trainer with checkpoint_dir to resume, received one without; give the folder"
+            )
+        latest: Path | None = rotation.latest()
+        if latest is None:
+            return False
+        try:
+            self.load_from_file(latest)
+        except Exception as error:
+            raise CheckpointError(
+                f"expected a checkpoint of this trainer in '{latest}', received {type(error).__name__}: "
+                f"{str(error)[:200]}; remove it to go back to the one before, or build the same networks"
+            ) from error
+        return True
