@@ -43,11 +43,10 @@ class MarginHook(TrainerHookBase):
     Source: paper, Algorithm 1, with eq. (6) and (11).
 
     Example:
-        >>> MarginHook(None, None, lipschitz_bound=2.0, update=("psi",))
-        Traceback (most recent call last):
-        ...
-        torchrl_sspl.errors.ConfigError: expected update among ('safety_margin', 'dynamics_margin'),
-        received ('psi',)
+        >>> from torchrl_sspl.data import TransitionStore
+        >>> hook = MarginHook(None, TransitionStore(8).replay_buffer(4), lipschitz_bound=2.0)
+        >>> hook.update
+        ('safety_margin', 'dynamics_margin')
     """
 
     def __init__(
