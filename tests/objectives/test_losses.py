@@ -11,10 +11,18 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
-from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
-from torchrl_sspl.functional import synthesis_violation
+from torchrl_sspl.errors import ConfigError, DTypeError, NotPositiveDefiniteError, ShapeError
+from torchrl_sspl.functional import lmi_matrix, synthesis_violation
+from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, SaLaD
-from torchrl_sspl.objectives import PRESETS, PolicyDeviationLoss, SaLaDLoss, SSPLLoss, SynthesisLoss
+from torchrl_sspl.objectives import (
+    PRESETS,
+    LipschitzLoss,
+    PolicyDeviationLoss,
+    SaLaDLoss,
+    SSPLLoss,
+    SynthesisLoss,
+)
 
 
 class Reads(nn.Module):
@@ -421,3 +429,34 @@ def test_loss_runs_on_cuda(preset: str) -> None:
     out = loss(benchmark.data(16, 32).to("cuda"))
     assert all(value.device.type == "cuda" for value in out.values())
     sum(value for key, value in out.items() if key.startswith("loss_")).backward()
+
+
+def test_lipschitz_loss_is_the_log_determinant_of_the_certificate() -> None:
+    torch.manual_seed(0)
+    barrier = LMIBarrier(2, (6, 5), lipschitz_bound=1.5)
+    out = LipschitzLoss(barrier, lipschitz_coeff=2.0)(TensorDict(batch_size=[]))
+    matrix = lmi_matrix(
+        [w.double() for w in barrier.weights()],
+        [m.double() for m in barrier.multipliers()],
+        1.5,
+        barrier.slope,
+    )
+    assert out["loss_lipschitz"].item() == pytest.approx(-2.0 * torch.logdet(matrix).item())
+    assert out["eigenvalue_min"].item() == pytest.approx(torch.linalg.eigvalsh(matrix)[0].item())
+    assert not out["eigenvalue_min"].requires_grad
+
+
+def test_lipschitz_loss_refuses_to_go_on_outside_the_cone() -> None:
+    torch.manual_seed(0)
+    barrier = LMIBarrier(2, (6, 5))
+    loss = LipschitzLoss(barrier)
+    with torch.no_grad():
+        for weight in barrier.weights():
+            weight.mul_(10.0)
+    with pytest.raises(NotPositiveDefiniteError, match="backtracking_step"):
+        loss(TensorDict(batch_size=[]))
+
+
+def test_sandwich_barriers_need_no_lipschitz_loss() -> None:
+    with pytest.raises(ConfigError, match="by construction"):
+        LipschitzLoss(SandwichBarrier(2, (8,)))

@@ -272,3 +272,11 @@ def test_resume_says_whether_there_was_a_checkpoint_and_refuses_a_foreign_one(tm
 def test_shared_parameters_are_listed_once() -> None:
     layer = torch.nn.Linear(2, 1)
     assert learnable([layer, torch.nn.Sequential(layer)]) == list(layer.parameters())
+
+
+@pytest.mark.slow
+def test_overhead_over_a_bare_loop_is_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    import trainer_overhead
+
+    assert trainer_overhead.main()["ratio"] <= 1.15
