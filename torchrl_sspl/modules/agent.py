@@ -186,7 +186,7 @@ class Agent(nn.Module):
             agent.load_state_dict(load_file(path / WEIGHTS_FILE))
         except CheckpointError:
             raise
-        except (ValueError, KeyError, TypeError, RuntimeError, OSError, SafetensorError) as error:
+        except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError, SafetensorError) as error:
             raise CheckpointError(
                 f"expected a readable agent in '{path}', received {type(error).__name__}: {str(error)[:200]}; restore the "
                 "files or train again"
