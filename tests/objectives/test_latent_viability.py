@@ -1,0 +1,205 @@
+"""Invariant sets of point clouds against systems whose sets are known."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_sspl.errors import EmptyRegionError, ShapeError
+from torchrl_sspl.objectives.latent_viability import (
+    barrier_targets,
+    nearby_residuals,
+    nearest_distance,
+    normal_projectors,
+    reach_times,
+    robust_invariant_set,
+)
+
+# --- an unstable line: z+ = 1.5 z + u, |u| <= 0.2; inside |z| < 1 it can be held exactly up to |z| = 0.2 / 0.5 = 0.4 ---
+
+ACTIONS = torch.linspace(-0.2, 0.2, 5)
+LINE = torch.linspace(-0.995, 0.995, 399)[:, None]  # a point every 0.005
+RIM = torch.cat([torch.linspace(-2.0, -1.0, 201), torch.linspace(1.0, 2.0, 201)])[:, None]
+
+
+# The distance to a cloud of points is positive between two of them: only a radius above half their spacing tells
+# inside from outside.
+SMALL = 0.006
+
+
+def unstable(z: Tensor) -> Tensor:
+    return 1.5 * z[:, None] + ACTIONS[None, :, None]
+
+
+def reach(radius: float, residuals: Tensor | None = None) -> float:
+    found = robust_invariant_set(unstable(LINE), LINE, RIM, radius=radius, residuals=residuals)
+    inside = LINE[found.inside, 0]
+    assert len(inside), "the set is empty"
+    assert float(inside.min()) == pytest.approx(-float(inside.max()), abs=1e-4)
+    assert len(inside) == round(float(inside.max()) / 0.005) * 2 + 1  # no holes
+    return float(inside.max())
+
+
+def test_unstable_line_can_be_held_up_to_its_known_border():
+    assert reach(SMALL) == pytest.approx(0.4, abs=0.025)
+
+
+@pytest.mark.parametrize("radius", [0.02, 0.05, 0.1])
+def test_radius_costs_what_the_mathematics_says(radius):
+    # Held if 1.5 z - 0.2 + radius < z, up to the spacing of the points.
+    assert reach(radius) == pytest.approx((0.2 - radius) / 0.5, abs=0.016)
+
+
+def test_larger_radius_gives_a_smaller_set():
+    sets = [robust_invariant_set(unstable(LINE), LINE, RIM, radius=r).inside for r in (SMALL, 0.03, 0.06, 0.1)]
+    for larger, smaller in zip(sets[:-1], sets[1:], strict=True):
+        assert bool((smaller <= larger).all())
+        assert int(smaller.sum()) < int(larger.sum())
+
+
+def test_radius_beyond_the_control_leaves_nothing():
+    assert not bool(robust_invariant_set(unstable(LINE), LINE, RIM, radius=0.3).inside.any())
+
+
+@pytest.mark.parametrize("error", [0.02, 0.05])
+def test_residuals_of_both_signs_cost_as_much_as_a_radius(error):
+    both = torch.tensor([[error], [-error]]).expand(len(LINE), 2, 1)
+    assert reach(SMALL, both) == pytest.approx(reach(SMALL + error), abs=0.011)
+
+
+def test_residual_on_one_side_moves_the_set_and_does_not_shrink_it():
+    # z+ = 1.5 z + u + 0.05 is the same system around z = -0.1.
+    offset = torch.full((len(LINE), 1, 1), 0.05)
+    found = robust_invariant_set(unstable(LINE), LINE, RIM, radius=SMALL, residuals=offset)
+    inside = LINE[found.inside, 0]
+    assert float(inside.min()) == pytest.approx(-0.5, abs=0.025)
+    assert float(inside.max()) == pytest.approx(0.3, abs=0.025)
+
+
+@pytest.mark.parametrize("radius", [SMALL, 0.05])
+def test_every_point_of_the_set_has_an_action_that_keeps_clear_of_everything_else(radius):
+    found = robust_invariant_set(unstable(LINE), LINE, RIM, radius=radius)
+    complement = torch.cat([RIM, LINE[~found.inside]])
+    best = found.clearance[found.inside].max(1)
+    assert bool((best.values > radius).all())
+    after = unstable(LINE)[found.inside][torch.arange(len(best.indices)), best.indices]
+    torch.testing.assert_close(nearest_distance(after, complement), best.values)
+
+
+# --- the integrator: z+ = z + u, every point can be held -------------------------------------------------------------
+
+
+def test_integrator_holds_everything_that_the_radius_allows():
+    step = LINE[:, None] + torch.tensor([-0.1, 0.0, 0.1])[None, :, None]
+    assert bool(robust_invariant_set(step, LINE, RIM, radius=0.05).inside.all())
+
+
+def test_integrator_that_cannot_stop_holds_nothing():
+    drift = LINE[:, None] + torch.tensor([0.1, 0.2])[None, :, None]
+    found = robust_invariant_set(drift, LINE, RIM, radius=SMALL)
+    assert not bool(found.inside.any())
+    assert found.iterations > 3
+
+
+def test_bad_shapes_and_missing_labels_are_errors():
+    step = unstable(LINE)
+    with pytest.raises(EmptyRegionError, match="unsafe latent"):
+        robust_invariant_set(step, LINE, RIM[:0], radius=0.0)
+    with pytest.raises(ShapeError, match="one row per candidate"):
+        robust_invariant_set(step, LINE[:-1], RIM, radius=0.0)
+    with pytest.raises(ShapeError, match="residuals"):
+        robust_invariant_set(step, LINE, RIM, radius=0.0, residuals=torch.zeros(3, 1, 1))
+
+
+# --- residuals --------------------------------------------------------------------------------------------------------
+
+
+def test_ends_of_the_leading_axis_are_where_the_errors_spread():
+    g = torch.Generator().manual_seed(0)
+    reference = torch.rand(4000, 2, generator=g)
+    along = torch.tensor([0.6, 0.8])
+    noise = 0.1 * torch.randn(4000, 1, generator=g) * along + torch.tensor([0.3, 0.0])
+    sample, ends = nearby_residuals(reference[:20], reference, noise, count=4, spread=2.0, neighbours=2000)
+    assert sample.shape == (20, 4, 2)
+    mean = ends[:, 0]
+    torch.testing.assert_close(mean, torch.tensor([[0.3, 0.0]]).expand(20, 2), atol=0.02, rtol=0)
+    offsets = ends[:, 1:] - mean[:, None]
+    longest = offsets[torch.arange(20), offsets.norm(dim=-1).argmax(1)]
+    torch.testing.assert_close(longest.norm(dim=-1), torch.full((20,), 0.2), atol=0.02, rtol=0)
+    torch.testing.assert_close((longest @ along).abs(), longest.norm(dim=-1), atol=1e-3, rtol=0)
+    torch.testing.assert_close(offsets.sum(1), torch.zeros(20, 2), atol=1e-5, rtol=0)  # both ends
+
+
+def test_sampled_residuals_are_those_of_the_nearest_latents():
+    reference = torch.linspace(0, 1, 101)[:, None]
+    sample, _ = nearby_residuals(torch.tensor([[0.5]]), reference, 10 * reference, count=3, spread=1.0, neighbours=9)
+    assert sorted(sample[0, :, 0].tolist()) == pytest.approx([4.9, 5.0, 5.1], abs=1e-4)
+
+
+def test_normal_projectors_of_a_plane_in_space():
+    g = torch.Generator().manual_seed(0)
+    plane = torch.cat([torch.rand(500, 2, generator=g), torch.full((500, 1), 0.2)], 1)
+    expected = torch.diag(torch.tensor([0.0, 0.0, 1.0])).expand(10, 3, 3)
+    torch.testing.assert_close(normal_projectors(plane[:10], plane), expected, atol=1e-4, rtol=0)
+
+
+# --- targets of the barrier -------------------------------------------------------------------------------------------
+
+
+def disc_targets(queries: Tensor, bound: float = 2.0) -> tuple[Tensor, Tensor]:
+    axis = torch.linspace(-1, 1, 81)
+    grid = torch.cartesian_prod(axis, axis)
+    disc = grid.norm(dim=1) <= 0.5
+    return barrier_targets(queries, grid[disc], grid[~disc], tube_radius=0.1, lipschitz_bound=bound)
+
+
+@pytest.mark.parametrize("bound", [0.5, 2.0])
+def test_targets_are_lipschitz_inside(bound):
+    queries = torch.rand(600, 2, generator=torch.Generator().manual_seed(0)) * 1.2 - 0.6
+    target, member = disc_targets(queries, bound)
+    x, t = queries[member], target[member]
+    assert 100 < len(x) < 600
+    slope = (t[:, None] - t).abs() / torch.cdist(x, x).clamp_min(1e-9)
+    assert float(slope.max()) <= bound * (1 + 1e-4)
+    assert float(slope.max()) > 0.9 * bound
+
+
+def test_targets_are_the_signed_distance_of_the_disc():
+    target, member = disc_targets(torch.tensor([[0.0, 0.0], [0.3, 0.0], [0.9, 0.0]]))
+    assert member.tolist() == [True, True, False]
+    assert target[:2].tolist() == pytest.approx([-2 * 0.5, -2 * 0.2], abs=2 * 0.04)
+    assert target[2] == pytest.approx(2 * (0.4 - 0.1), abs=2 * 0.04)
+
+
+def test_targets_are_negative_exactly_on_members():
+    queries = torch.rand(500, 2, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    target, member = disc_targets(queries)
+    assert bool((target[member] < 0).all())
+    assert bool((target[~member] > 0).all())
+
+
+def test_targets_need_both_sides():
+    some = torch.zeros(1, 2)
+    for inside, outside in ((some[:0], some), (some, some[:0])):
+        with pytest.raises(EmptyRegionError, match="at least one point"):
+            barrier_targets(some, inside, outside, tube_radius=0.1, lipschitz_bound=1.0)
+
+
+# --- times ------------------------------------------------------------------------------------------------------------
+
+
+def test_times_of_a_chain_are_its_lengths():
+    chain, goal = torch.arange(0, 10.0)[:, None], torch.tensor([[10.0]])
+    steps = reach_times(torch.stack([(chain - 1).clamp_min(0), chain + 1], 1), chain, goal, neighbours=1)
+    lengths = 10 - chain[:, 0]
+    torch.testing.assert_close(steps[:, 1], lengths)  # towards the goal
+    torch.testing.assert_close(steps[1:, 0], lengths[1:] + 2)  # one step back and forth
+    assert steps[0, 0] == 11
+
+
+def test_what_cannot_reach_the_goal_gets_the_horizon():
+    chain, goal = torch.arange(0, 5.0)[:, None], torch.tensor([[10.0]])
+    steps = reach_times((chain - 1).clamp_min(0)[:, None], chain, goal, horizon=20, neighbours=1)
+    assert float(steps.min()) >= 20
+    assert float(steps.max()) <= 21
