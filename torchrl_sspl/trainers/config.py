@@ -216,9 +216,12 @@ class TrainingConfig:
     def load(cls, path: str | Path) -> TrainingConfig:
         """Read a configuration that :meth:`save` has written."""
         try:
-            return cls.from_dict(json.loads(Path(path).read_text()))
+            values = json.loads(Path(path).read_text())
         except (OSError, json.JSONDecodeError) as error:
             raise ConfigError(f"expected a readable configuration at '{path}', received {error}") from error
+        if not isinstance(values, dict):
+            raise ConfigError(f"expected an object of settings at '{path}', received a {type(values).__name__}")
+        return cls.from_dict(values)
 
 
 def make_config(overrides: Sequence[str] = (), **defaults: Any) -> TrainingConfig:
@@ -339,6 +342,6 @@ def _convert(key: str, value: Any, kind: Any) -> Any:
                 raise ValueError(value)
             return int(number)
         return kind(value)
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         name = getattr(kind, "__name__", str(kind))
         raise ConfigError(f"expected {key} to be of type {name}, received '{value}'") from error
