@@ -1,7 +1,8 @@
 """Figures, films and reports of a run; needs the extra ``viz`` (matplotlib, imageio-ffmpeg) when used, not when imported."""
 
 from torchrl_sspl.viz.animation import animate
-from torchrl_sspl.viz.figures import frames, latent_space, read_log, state_plane, training_curves, trajectories
+from torchrl_sspl.viz.curves import read_log, training_curves
+from torchrl_sspl.viz.figures import frames, latent_space, state_plane, trajectories
 from torchrl_sspl.viz.plane import Plane
 from torchrl_sspl.viz.report import format_value, requirement_rows, write_report
 

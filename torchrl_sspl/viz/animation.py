@@ -6,7 +6,7 @@ import importlib.util
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,9 +14,6 @@ from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.viz.plane import BARRIER_COLOUR, PATH_COLOURS, Plane, array, new_figure, require, zero_level
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _WIDTH, _HEIGHT, _DPI = 9.6, 5.4, 80  # 768 x 432 pixels: even, as the video codec wants them
 
@@ -40,7 +37,7 @@ def animate(
     Args:
         agent: has ``act(pixels (1, 6, H, W)) -> action (1, m), barrier (1, 1)``.
         env: has ``observe``, ``dynamics``, ``wrap``; and the regions, if no plane is given.
-        start: ``(state_dim,)`` first state.
+        start: ``(state_dim,)`` or ``(1, state_dim)`` first state.
         steps: number of steps.
         path: the file to write, ``.mp4`` or ``.gif``.
         plane: the coordinates shown; default: the first two of the environment's state.
@@ -65,6 +62,8 @@ def animate(
         raise ConfigError(f"steps: expected an integer >= 1, received {steps!r}.")
     plane = plane or Plane.of(env)
     first = torch.as_tensor(start, dtype=torch.float32)
+    if first.shape == (1, plane.dim):
+        first = first[0]
     if first.shape != (plane.dim,):
         raise ShapeError(f"start: expected shape ({plane.dim},), received {tuple(first.shape)}.")
     array("start", first, (plane.dim,))
@@ -82,7 +81,12 @@ def animate(
         values.append(float(barrier))
         actions.append(action[0].cpu().numpy())
         previous, state = state, env.wrap(env.dynamics(state, action))
-    episode = (np.stack(states)[:, list(plane.coords)], np.stack(pictures), np.array(values), np.stack(actions)[:, 0])
+    episode = (
+        np.stack(states)[:, list(plane.coords)],
+        np.stack(pictures),
+        np.array(values),
+        np.stack(actions)[:, 0],
+    )
     images = _images(episode, plane, background, action_name, title)
     path.parent.mkdir(parents=True, exist_ok=True)
     (_write_mp4 if path.suffix == ".mp4" else _write_gif)(path, images, fps)

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.viz.curves import training_curves
 from torchrl_sspl.viz.plane import (
     BARRIER_COLOUR,
     KERNEL_COLOUR,
@@ -26,8 +25,9 @@ from torchrl_sspl.viz.plane import (
 )
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+__all__ = ["frames", "latent_space", "state_plane", "training_curves", "trajectories"]
 
 _POINT_SIZE = {0: 5, 1: 9, 2: 9}
 
@@ -53,7 +53,14 @@ def _scatter(ax: Any, points: np.ndarray, codes: np.ndarray, **style: Any) -> No
         p = points[codes == code]
         if len(p):
             ax.scatter(
-                *p.T, s=_POINT_SIZE[code], c=colour, marker=marker, linewidths=0, alpha=0.75, label=label, **style
+                *p.T,
+                s=_POINT_SIZE[code],
+                c=colour,
+                marker=marker,
+                linewidths=0,
+                alpha=0.75,
+                label=label,
+                **style,
             )
 
 
@@ -89,8 +96,8 @@ def latent_space(
     Example:
         >>> z = torch.rand(100, 2) * 2 - 1
         >>> figure = latent_space(z, (z[:, :1] > 0).long() + 1, lambda z: z[:, :1])
-        >>> len(figure.axes)
-        1
+        >>> [axes.get_ylabel() for axes in figure.axes]
+        ['z₂', 'B(z)']
     """
     z = array("latent", latent, (None, None))
     n, p = z.shape
@@ -299,7 +306,9 @@ def trajectories(
     chosen = _spread(x[0][:, list(plane.coords)] / extent, min(episodes, n))
     largest = action_scale or max(float(np.abs(u).max()), 1e-12)
     size = f"; the longest arrow is {largest:.3g} in {action_name}"
-    figure = new_figure(10.5, 5.0, (caption or f"{len(chosen)} trajectories of the learned policy") + size + ".")
+    figure = new_figure(
+        10.5, 5.0, (caption or f"{len(chosen)} trajectories of the learned policy").rstrip(".") + size + "."
+    )
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
     ax = figure.add_subplot(grid[:, 0])
     plane.draw(ax, cover=x[:, chosen][..., list(plane.coords)].reshape(-1, 2))
@@ -310,13 +319,15 @@ def trajectories(
             handles.append(_line(BARRIER_COLOUR, "B = 0"))
     every = max(1, steps // arrows)
     marker = require("matplotlib.lines").Line2D
-    for colour, k in zip(np.resize(PATH_COLOURS, len(chosen)), chosen):
+    for colour, k in zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True):
         path = x[:, k][:, list(plane.coords)]
         ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.2, zorder=3)
         ax.plot(*path[0], "o", color=colour, markersize=5, markeredgecolor="white", zorder=5)
         at = _spaced(path / extent, every, 0.02)
         along = _directions(path / extent, action_direction)
-        length = 0.13 * extent * along * (u[:, k] if action_direction is not None else np.abs(u[:, k]))[:, None] / largest
+        length = (
+            0.13 * extent * along * (u[:, k] if action_direction is not None else np.abs(u[:, k]))[:, None] / largest
+        )
         ax.quiver(
             *path[at].T,
             *length[at].T,
@@ -334,11 +345,13 @@ def trajectories(
         )
     handles.append(marker([], [], marker="o", color="#555555", linewidth=1.2, label="start and path"))
     arrow = "$\\uparrow$" if action_direction is not None else "$\\rightarrow$"
-    handles.append(marker([], [], marker=arrow, color="#555555", linestyle="", markersize=9, label=f"{action_name}, size"))
+    handles.append(
+        marker([], [], marker=arrow, color="#555555", linestyle="", markersize=9, label=f"{action_name}, size")
+    )
     figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
 
     time = np.arange(steps + 1) * (dt or 1.0)
-    colours = list(zip(np.resize(PATH_COLOURS, len(chosen)), chosen))
+    colours = list(zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True))
     if values is not None:
         upper = figure.add_subplot(grid[0, 1])
         for colour, k in colours:
@@ -427,130 +440,3 @@ def frames(env: Any, states: Any, *, captions: Sequence[str] | None = None, both
     for row in range(rows):
         axes[row, 0].set_ylabel("t \u2212 1" if both and row == 0 else "t", fontsize=9)
     return figure
-
-
-def read_log(path: str | Path) -> list[dict[str, Any]]:
-    """Rows of a training's ``log.jsonl``; a last line cut short by an interruption is left out.
-
-    Args:
-        path: the file.
-
-    Returns:
-        One dictionary per row, each with "phase", "round" and "step".
-
-    Raises:
-        CheckpointError: the file is missing, empty, or not a log.
-
-    Source: none.
-    """
-    path = Path(path)
-    if not path.is_file():
-        raise CheckpointError(f"expected the log of a training at '{path}', found no file; give a run's log.jsonl.")
-    lines = path.read_text().splitlines()
-    rows = []
-    for number, line in enumerate(lines, 1):
-        try:
-            row = json.loads(line)
-            rows.append({**row, "phase": str(row["phase"]), "round": int(row["round"]), "step": int(row["step"])})
-        except (ValueError, KeyError, TypeError) as error:
-            if number == len(lines) and rows:
-                break
-            raise CheckpointError(
-                f"expected JSON with phase, round and step in line {number} of '{path}', received {line[:60]!r}."
-            ) from error
-    if not rows:
-        raise CheckpointError(f"expected at least one row in '{path}', received an empty log.")
-    return rows
-
-
-def training_curves(path: str | Path) -> Figure:
-    """Losses of every phase of a training over its optimiser steps, and the held-out checks of every round.
-
-    Args:
-        path: a run's ``log.jsonl``: one JSON object per line with ``phase``, ``round``, ``step`` and ``loss_*``.
-
-    Returns:
-        The figure, one panel per phase; its label is a caption.
-
-    Raises:
-        CheckpointError: the file is missing, empty, or not a log.
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Algorithm 1 (phases); the paper shows no curves.
-
-    Example:
-        >>> import tempfile
-        >>> with tempfile.NamedTemporaryFile("w", suffix=".jsonl") as file:
-        ...     _ = file.write('{"phase": "fit", "round": 0, "step": 100, "loss_safe": 0.1}')
-        ...     file.flush()
-        ...     len(training_curves(file.name).axes)
-        1
-    """
-    log = read_log(path)
-    phases: dict[str, list[dict[str, Any]]] = {}
-    for row in log:
-        if any(k.startswith("loss") for k in row) or row["phase"] == "check":
-            phases.setdefault(row["phase"], []).append(row)
-    if not phases:
-        raise CheckpointError(f"expected losses or checks in '{path}', received {len(log)} rows without either.")
-    columns = min(3, len(phases))
-    lines = math.ceil(len(phases) / columns)
-    figure = new_figure(
-        4.0 * columns, 3.1 * lines, "Losses of every phase (rounds follow one another, dotted lines between them)."
-    )
-    for k, (phase, rows) in enumerate(phases.items()):
-        ax = figure.add_subplot(lines, columns, k + 1)
-        ax.set_title(phase, fontsize=10)
-        (_draw_checks if phase == "check" else _draw_losses)(ax, rows)
-        ax.tick_params(labelsize=8)
-    return figure
-
-
-def _draw_losses(ax: Axes, rows: list[dict[str, Any]]) -> None:
-    at, offset, last = [], 0, 0
-    previous = rows[0]["round"]
-    for row in rows:
-        if row["round"] != previous:
-            offset, previous = offset + last, row["round"]
-            ax.axvline(offset, color="#aaaaaa", linewidth=0.8, linestyle=":")
-        last = row["step"]
-        at.append(offset + last)
-    names = list(dict.fromkeys(k for row in rows for k in row if k.startswith("loss")))
-    for colour, name in zip(np.resize(PATH_COLOURS, len(names)), names):
-        value = np.array([float(row.get(name) or 0.0) for row in rows])
-        label = name.removeprefix("loss_").removeprefix("loss") or "total"
-        if (value > 0).any():
-            shown = np.where(value > 0, value, np.nan)
-            ax.plot(at, shown, ".-", color=colour, linewidth=1.0, markersize=3, label=label)
-        else:
-            ax.plot([], [], color=colour, label=f"{label} (0)")
-    if any((float(row.get(n) or 0.0)) > 0 for row in rows for n in names):
-        ax.set_yscale("log")
-    ax.set_xlabel("step", fontsize=8)
-    _legend_below(ax)
-
-
-def _legend_below(ax: Axes) -> None:
-    ax.legend(
-        fontsize=7, frameon=False, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=3, labelspacing=0.25,
-        columnspacing=1.0, handlelength=1.4,
-    )
-
-
-def _draw_checks(ax: Axes, rows: list[dict[str, Any]]) -> None:
-    number = [row["round"] for row in rows]
-    for colour, name, label in ((PATH_COLOURS[0], "size", "size of the set"), (PATH_COLOURS[1], "returned", "returned")):
-        ax.plot(number, [float(row.get(name) or 0.0) for row in rows], "o-", color=colour, linewidth=1.1, label=label)
-    failed = [row for row in rows if not row.get("passed")]
-    ax.plot(
-        [r["round"] for r in failed],
-        [float(r.get("size") or 0.0) for r in failed],
-        "x",
-        color="#c8372d",
-        markersize=10,
-        label="check failed",
-    )
-    ax.set(ylim=(-0.03, 1.03), xticks=sorted(set(number)))
-    ax.set_xlabel("round", fontsize=8)
-    ax.set_ylabel("share", fontsize=8)
-    _legend_below(ax)

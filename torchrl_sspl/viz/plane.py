@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, NonFiniteError, ShapeError
 from torchrl_sspl.sets import Box, Difference, Region
@@ -225,14 +224,18 @@ class Plane:
         """
         i, j = self.coords
         corners = np.array([[self.low[i], self.low[j]], [self.high[i], self.high[j]]])
-        lower, upper = corners if cover is None else (
-            np.minimum(corners[0], cover.min(0)), np.maximum(corners[1], cover.max(0))
+        lower, upper = (
+            corners if cover is None else (np.minimum(corners[0], cover.min(0)), np.maximum(corners[1], cover.max(0)))
         )
         # A little room beyond a point, none where the state space itself is the limit.
-        lower, upper = (b + 0.03 * (b - c) / np.maximum(np.abs(b - c), 1e-9) * (upper - lower) * (np.abs(b - c) > 1e-5)
-                        for b, c in zip((lower, upper), corners))
+        lower, upper = (
+            b + 0.03 * (b - c) / np.maximum(np.abs(b - c), 1e-9) * (upper - lower) * (np.abs(b - c) > 1e-5)
+            for b, c in zip((lower, upper), corners, strict=True)
+        )
         extent = (float(lower[0]), float(upper[0]), float(lower[1]), float(upper[1]))
-        state = torch.tensor([self.fixed.get(k, (a + b) / 2) for k, (a, b) in enumerate(zip(self.low, self.high))])
+        state = torch.tensor(
+            [self.fixed.get(k, (a + b) / 2) for k, (a, b) in enumerate(zip(self.low, self.high, strict=True))]
+        )
         state = state.repeat(resolution * resolution, 1)
         # Centres of the pixels, so that an area ends where its set ends.
         middle = (torch.arange(resolution) + 0.5) / resolution
@@ -259,8 +262,10 @@ class Plane:
             if math.isclose(self.period[k], 2 * math.pi, rel_tol=1e-4):
                 ticks = [-math.pi, -math.pi / 2, 0, math.pi / 2, math.pi]
                 labels = ["\u2212\u03c0", "\u2212\u03c0/2", "0", "\u03c0/2", "\u03c0"]
-                shown = [(t, s) for t, s in zip(ticks, labels) if self.low[k] - 1e-3 <= t <= self.high[k] + 1e-3]
-                axis.set_ticks([t for t, _ in shown], [s for _, s in shown])
+                marks = [
+                    (t, s) for t, s in zip(ticks, labels, strict=True) if self.low[k] - 1e-3 <= t <= self.high[k] + 1e-3
+                ]
+                axis.set_ticks([t for t, _ in marks], [s for _, s in marks])
 
     def set_handles(self) -> list[Any]:
         """Legend entries of the areas."""
@@ -301,8 +306,8 @@ class Plane:
             )
         out = {}
         for name, value in values.items():
-            v = torch.as_tensor(value)
-            v = array(name, v[:, 0] if v.ndim == 2 else v, (len(x),))
+            column = torch.as_tensor(value)
+            v = array(name, column[:, 0] if column.ndim == 2 else column, (len(x),))
             table = np.empty(sizes, v.dtype)
             table.reshape(-1)[flat] = v
             for k in reversed([k for k in range(self.dim) if k not in self.coords]):

@@ -30,7 +30,8 @@ _MIME = {
 }
 _ASSUMED = (
     "Measured figures hold for the distribution that they were sampled from, with the stated confidence: independent "
-    "states drawn uniformly from the named set, the simulator's dynamics and its pictures.",
+    "states drawn uniformly from the named set, the simulator's dynamics and its pictures. A bound of a figure on a grid "
+    "reads the grid as if it were such a sample.",
     "Nothing is said about other cameras, other physics or states outside the state space.",
 )
 
@@ -91,11 +92,10 @@ def _bound(m: Mapping[str, Any]) -> str:
     lower, upper, events, n = (m.get(k) for k in ("lower", "upper", "events", "n"))
     if lower is None or upper is None or any(isinstance(v, float) and math.isnan(v) for v in (lower, upper)):
         return "\u2013"
+    low, high = f"{100 * lower:.3g}", f"{100 * upper:.3g}"
     if events == 0:
-        return f"\u2264 {format_value(upper, 'share')}"
-    if events is not None and events == n:
-        return f"\u2265 {format_value(lower, 'share')}"
-    return f"{format_value(lower, 'share')} to {format_value(upper, 'share')}"
+        return f"\u2264 {high} %"
+    return f"\u2265 {low} %" if events is not None and events == n else f"{low} to {high} %"
 
 
 def _count(value: Any) -> str:
@@ -151,8 +151,12 @@ def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple
         unit = getattr(m, "unit", "share" if r.must <= 1 and r.aim <= 1 else "")
         sign = {"<=": "\u2264", ">=": "\u2265"}[r.sense]
         # Nothing lies below no event at all, nothing above all of them.
-        limits = [f"{'' if r.sense == '<=' and v == 0 else sign + ' '}{format_value(v, unit)}" for v in (r.must, r.aim)]
-        rows.append((r.label, m, limits[0], limits[1], r.verdict(evaluation)))
+        end = {"<=": 0.0, ">=": 1.0 if unit == "share" else math.inf}[r.sense]
+        limits = [f"{'' if v == end else sign + ' '}{format_value(v, unit)}" for v in (r.must, r.aim)]
+        verdict = r.verdict(evaluation)
+        if unit == "share" and verdict.startswith("missed by "):
+            verdict = f"missed by {format_value(float(verdict.removeprefix('missed by ')), 'share')}"
+        rows.append((r.label, m, limits[0], limits[1], verdict))
     return rows
 
 
@@ -163,10 +167,7 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
         if len(row) != 5:
             raise ShapeError(f"summary: expected rows (label, value, must, aim, verdict), received {len(row)} entries.")
         label, value, must, aim, verdict = row
-        m = measurements.get(label, {})
-        if value is not None and not isinstance(value, (int, float, str)) and not hasattr(value, "item"):
-            m = _plain("summary", value)
-            value = m.get("value")
+        value, m = _resolve(label, value, measurements)
         shown = format_value(value, m.get("unit", ""))
         if shown == NOT_MEASURED:
             verdict = NOT_MEASURED
@@ -191,9 +192,9 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
     elif unknown:
         headline, kind = f"{reached} of {len(rows)} requirements reached, {unknown} not measured", "none"
     else:
-        headline, kind = f"All {len(rows)} requirements reached", "good"
+        headline, kind = f"All requirements reached ({len(rows)} of {len(rows)})", "good"
     if reached:
-        headline += f"; {aims} of them at the aim" if not missed else f", {reached} reached"
+        headline += f", {aims} at the aim" if not missed else f", {reached} reached"
     head = ("Requirement", "Measured", "95 % bound", "n", "Must", "Aim", "Verdict")
     return headline, kind, _table(head, out, kind="summary") if rows else ""
 
@@ -231,7 +232,9 @@ def _figure(name: str, value: Any) -> str:
     elif isinstance(value, (str, Path)):
         uri, mime = _file_uri(value)
     else:
-        raise ConfigError(f"figures[{name!r}]: expected a matplotlib Figure or a path, received {type(value).__name__}.")
+        raise ConfigError(
+            f"figures[{name!r}]: expected a matplotlib Figure or a path, received {type(value).__name__}."
+        )
     text = f"<b>{escape(name)}.</b> {escape(caption)}"
     return f"<figure>{_media(uri, mime, caption or name)}<figcaption>{text}</figcaption></figure>"
 
@@ -250,17 +253,24 @@ def _list(items: Sequence[str]) -> str:
     return "<ul>" + "".join(f"<li>{escape(str(i))}</li>" for i in items) + "</ul>"
 
 
-def _measured_line(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> list[str]:
-    """The measured side of the verdict: shares of the summary with n and bound."""
+def _measured_lines(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> list[str]:
+    """The measured side of the verdict: shares of the summary with n and bound, what was missed first."""
     lines = []
-    for label, value, *_ in rows:
-        m = measurements.get(label, {})
-        if value is not None and not isinstance(value, (int, float, str)) and not hasattr(value, "item"):
-            m = _plain("summary", value)
+    for label, value, _, _, verdict in rows:
+        _, m = _resolve(label, value, measurements)
         if m.get("n") and m.get("upper") is not None:
+            kind = _verdict_kind(verdict)
             shown = format_value(m.get("value"), "share")
-            lines.append(f"{label}: {shown} of {m['n']:,} (95 %: {_bound(m)})")
-    return lines
+            lines.append((kind != "bad", f"{_BADGES[kind]} {label}: {shown} of {m['n']:,} (95 %: {_bound(m)})"))
+    return [line for _, line in sorted(lines, key=lambda pair: pair[0])]
+
+
+def _resolve(label: str, value: Any, measurements: Mapping[str, dict[str, Any]]) -> tuple[Any, Mapping[str, Any]]:
+    """Value of a row of the summary, and the measurement behind it where there is one."""
+    if value is None or isinstance(value, (int, float, str)) or hasattr(value, "item"):
+        return value, measurements.get(label, {})
+    m = _plain("summary", value)
+    return m.get("value"), m
 
 
 def _sizes(checks: Sequence[Any]) -> str:
@@ -283,7 +293,7 @@ def write_report(
     certificate_html: str | None = None,
     video: str | Path | None = None,
     notes: str = "",
-    proved: Sequence[str] | None = None,
+    proved: Sequence[str] = (),
     assumed: Sequence[str] | None = None,
 ) -> Path:
     """Write a run's report: one HTML file without scripts or outside resources, for desk and phone, light and dark.
@@ -304,7 +314,7 @@ def write_report(
         certificate_html: a certificate's own page or fragment, shown in a frame that may run no scripts.
         video: mp4, webm or gif file.
         notes: text, in paragraphs separated by empty lines.
-        proved: statements that are proved; default: the measurements whose note begins with "proved".
+        proved: statements that are proved. Never derived from the measurements: pass what a proof has returned.
         assumed: what both rest on; default: what holds for every sampled figure.
 
     Returns:
@@ -320,27 +330,28 @@ def write_report(
         >>> import tempfile
         >>> folder = tempfile.mkdtemp()
         >>> page = write_report(folder + "/report.html", title="Demo", summary=[("a", 0.0, "0", "0", "aim")])
-        >>> "All 1 requirements reached" in page.read_text()
+        >>> "All requirements reached (1 of 1)" in page.read_text()
         True
     """
     data = {name: _plain(f"measurements[{name!r}]", m) for name, m in (measurements or {}).items()}
     config = dict(config or {})
     headline, kind, table = _summary(summary, data)
-    if proved is None:
-        found = [(n, m) for n, m in data.items() if str(m.get("note", "")).startswith("proved")]
-        proved = [f"{n.replace('_', ' ')} = {format_value(m.get('value'))}: {m['note']}" for n, m in found]
-    measured = _measured_line(summary, data)
+    measured = _measured_lines(summary, data)
     columns = [
-        ("Proved", list(proved) or ["Nothing: every figure of this page is measured."]),
+        ("Proved", list(proved) or ["Nothing is claimed as proved."]),
         ("Measured", measured or ["No share with a confidence bound."]),
         ("Assumed", list(_ASSUMED if assumed is None else assumed) or ["Nothing stated."]),
     ]
     facts = [f"seed {config['seed']}"] if "seed" in config else []
     facts += [f"preset {config['preset']}"] if "preset" in config else []
-    facts += [f"torchrl_sspl {_version('torchrl-sspl')}", f"torch {_version('torch')}", f"Python {platform.python_version()}"]
+    facts += [
+        f"torchrl_sspl {_version('torchrl-sspl')}",
+        f"torch {_version('torch')}",
+        f"Python {platform.python_version()}",
+    ]
 
     parts = [
-        f"<header><h1>{escape(title)}</h1><p class='facts'>{escape(' \u00b7 '.join(facts))}</p></header>",
+        f"<header><h1>{escape(title)}</h1><p class='facts'>{escape(' / '.join(facts))}</p></header>",
         f'<section class="verdict {kind}"><h2>{_BADGES[kind]} {escape(headline)}</h2><div class="columns">'
         + "".join(f"<div><h3>{name}</h3>{_list(items)}</div>" for name, items in columns)
         + "</div></section>",
@@ -377,7 +388,9 @@ def write_report(
             for n, m in data.items()
         ]
         body = _table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
-        parts.append(f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>")
+        parts.append(
+            f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>"
+        )
     if config:
         rows = [[f"<code>{escape(k)}</code>", escape(str(v))] for k, v in _flatten(config)]
         body = _table(("Key", "Value"), rows, kind="plain")

@@ -14,13 +14,14 @@ section{background:var(--card);border:1px solid var(--line);border-radius:10px;p
 .verdict{border-left:8px solid var(--none)}.verdict h2{font-size:1.45rem;line-height:1.25}
 .verdict.good{border-left-color:var(--good)}.verdict.good h2{color:var(--good)}
 .verdict.bad{border-left-color:var(--bad)}.verdict.bad h2{color:var(--bad)}
-.columns{display:grid;grid-template-columns:repeat(3,1fr);gap:20px;font-size:.92rem}
-ul{margin:0;padding-left:1.1em}li{margin:.15em 0}
+.columns{display:grid;grid-template-columns:2fr 3fr 2fr;gap:20px;font-size:.92rem}
+.columns ul{list-style:none;padding:0}.columns li{margin:.35em 0}ul{margin:0;padding-left:1.1em}li{margin:.15em 0}
 .scroll{overflow-x:auto}
 table{border-collapse:collapse;width:100%;font-size:.9rem;font-variant-numeric:tabular-nums}
 th,td{text-align:left;padding:.4em .6em;border-bottom:1px solid var(--line);vertical-align:top}
 th{color:var(--soft);font-weight:600;white-space:nowrap}tbody tr:last-child td{border-bottom:0}
-code{font-size:.88em}
+td{overflow-wrap:break-word}table.summary td:nth-child(n+2):nth-child(-n+6){white-space:nowrap}
+code{font-size:.88em;overflow-wrap:anywhere}
 .badge{display:inline-block;border-radius:6px;padding:.05em .5em;font-weight:600;background:var(--none-bg);color:var(--none)}
 .badge.good{background:var(--good-bg);color:var(--good)}.badge.fair{background:var(--fair-bg);color:var(--fair)}
 .badge.bad{background:var(--bad-bg);color:var(--bad)}

@@ -1,0 +1,162 @@
+"""Curves of a training, read from its log."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from torchrl_sspl.errors import CheckpointError
+from torchrl_sspl.viz.plane import PATH_COLOURS, new_figure
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def read_log(path: str | Path) -> list[dict[str, Any]]:
+    """Rows of a training's ``log.jsonl``; a last line cut short by an interruption is left out.
+
+    Args:
+        path: the file.
+
+    Returns:
+        One dictionary per row, each with "phase", "round" and "step".
+
+    Raises:
+        CheckpointError: the file is missing, empty, or not a log.
+
+    Source: none.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise CheckpointError(f"expected the log of a training at '{path}', found no file; give a run's log.jsonl.")
+    lines = path.read_text().splitlines()
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            row = json.loads(line)
+            rows.append({**row, "phase": str(row["phase"]), "round": int(row["round"]), "step": int(row["step"])})
+        except (ValueError, KeyError, TypeError) as error:
+            if number == len(lines) and rows:
+                break
+            raise CheckpointError(
+                f"expected JSON with phase, round and step in line {number} of '{path}', received {line[:60]!r}."
+            ) from error
+    if not rows:
+        raise CheckpointError(f"expected at least one row in '{path}', received an empty log.")
+    return rows
+
+
+def training_curves(path: str | Path) -> Figure:
+    """Losses of every phase of a training over its optimiser steps, and the held-out checks of every round.
+
+    Args:
+        path: a run's ``log.jsonl``: one JSON object per line with ``phase``, ``round``, ``step`` and ``loss_*``.
+
+    Returns:
+        The figure, one panel per phase; its label is a caption.
+
+    Raises:
+        CheckpointError: the file is missing, empty, or not a log.
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Algorithm 1 (phases); the paper shows no curves.
+
+    Example:
+        >>> import tempfile
+        >>> with tempfile.NamedTemporaryFile("w", suffix=".jsonl") as file:
+        ...     _ = file.write('{"phase": "fit", "round": 0, "step": 100, "loss_safe": 0.1}')
+        ...     file.flush()
+        ...     len(training_curves(file.name).axes)
+        1
+    """
+    log = read_log(path)
+    phases: dict[str, list[dict[str, Any]]] = {}
+    for row in log:
+        if any(k.startswith("loss") for k in row) or row["phase"] == "check":
+            phases.setdefault(row["phase"], []).append(row)
+    if not phases:
+        raise CheckpointError(f"expected losses or checks in '{path}', received {len(log)} rows without either.")
+    columns = min(3, len(phases))
+    lines = math.ceil(len(phases) / columns)
+    figure = new_figure(
+        4.0 * columns,
+        3.1 * lines,
+        "Losses of every phase (rounds follow one another, dotted lines between them).",
+    )
+    for k, (phase, rows) in enumerate(phases.items()):
+        ax = figure.add_subplot(lines, columns, k + 1)
+        ax.set_title(phase, fontsize=10)
+        (_draw_checks if phase == "check" else _draw_losses)(ax, rows)
+        ax.tick_params(labelsize=8)
+    return figure
+
+
+def _draw_losses(ax: Axes, rows: list[dict[str, Any]]) -> None:
+    at, offset, last = [], 0, 0
+    previous = rows[0]["round"]
+    for row in rows:
+        if row["round"] != previous:
+            offset, previous = offset + last, row["round"]
+            ax.axvline(offset, color="#aaaaaa", linewidth=0.8, linestyle=":")
+        last = row["step"]
+        at.append(offset + last)
+    names = list(dict.fromkeys(k for row in rows for k in row if k.startswith("loss")))
+    for colour, name in zip(np.resize(PATH_COLOURS, len(names)), names, strict=True):
+        value = np.array([float(row.get(name) or 0.0) for row in rows])
+        label = name.removeprefix("loss_").removeprefix("loss") or "total"
+        if (value > 0).any():
+            shown = np.where(value > 0, value, np.nan)
+            ax.plot(at, shown, ".-", color=colour, linewidth=1.0, markersize=3, label=label)
+        else:
+            ax.plot([], [], color=colour, label=f"{label} (0)")
+    if any((float(row.get(n) or 0.0)) > 0 for row in rows for n in names):
+        ax.set_yscale("log")
+    ax.set_xlabel("step", fontsize=8)
+    _legend_below(ax)
+
+
+def _legend_below(ax: Axes) -> None:
+    ax.legend(
+        fontsize=7,
+        frameon=False,
+        loc="upper center",
+        bbox_to_anchor=(0.5, -0.2),
+        ncols=3,
+        labelspacing=0.25,
+        columnspacing=1.0,
+        handlelength=1.4,
+    )
+
+
+def _draw_checks(ax: Axes, rows: list[dict[str, Any]]) -> None:
+    number = [row["round"] for row in rows]
+    for colour, name, label in (
+        (PATH_COLOURS[0], "size", "size of the set"),
+        (PATH_COLOURS[1], "returned", "returned"),
+    ):
+        ax.plot(
+            number,
+            [float(row.get(name) or 0.0) for row in rows],
+            "o-",
+            color=colour,
+            linewidth=1.1,
+            label=label,
+        )
+    failed = [row for row in rows if not row.get("passed")]
+    ax.plot(
+        [r["round"] for r in failed],
+        [float(r.get("size") or 0.0) for r in failed],
+        "x",
+        color="#c8372d",
+        markersize=10,
+        label="check failed",
+    )
+    ax.set(ylim=(-0.03, 1.03), xticks=sorted(set(number)))
+    ax.set_xlabel("round", fontsize=8)
+    ax.set_ylabel("share", fontsize=8)
+    _legend_below(ax)
