@@ -187,12 +187,12 @@ class ForgetsWhatIsPutBack(SaLaDLoss):
         pass
 
 
-@breaks("captures_as_one_graph", "salad")
-class AsksForAValue(SaLaDLoss):
-    def _salad_terms(self, batch: LatentBatch) -> dict[str, Tensor]:
-        terms = super()._salad_terms(batch)
-        if float(terms["dynamics_error_max"]) < 0.0:
-            terms["loss_consistency"] = terms["loss_consistency"] + 1.0
+@breaks("captures_as_one_graph", "deviation")
+class AsksForAValue(PolicyDeviationLoss):
+    def _deviation_terms(self, batch: LatentBatch) -> dict[str, Tensor]:
+        terms = super()._deviation_terms(batch)
+        if float(terms["loss_policy_deviation"].detach()) < 0.0:
+            terms["loss_policy_deviation"] = terms["loss_policy_deviation"] + 1.0
         return terms
 
 

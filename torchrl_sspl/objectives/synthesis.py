@@ -171,7 +171,7 @@ class SynthesisLoss(LatentLoss):
             barrier,
             barrier_next,
             mode=self.mode,
-            safety_margin=self.safety_margin if self.mode == "paper" else 0.0,
+            safety_margin=self.safety_margin,  # of mode "paper" alone
             dynamics_margin=self.dynamics_margin,
             decay=self.decay,
             decrement=self.decrement,
