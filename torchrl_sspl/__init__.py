@@ -31,7 +31,7 @@ _NAMES = {
     "evaluate": "trainers.evaluation",
 }
 
-__all__ = ["__version__", *_NAMES, *_SUBPACKAGES]  # noqa: PLE0604
+__all__ = ["__version__", *_NAMES, *_SUBPACKAGES]
 
 
 def __getattr__(name: str) -> Any:

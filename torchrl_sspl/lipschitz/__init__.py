@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from torchrl_sspl.lipschitz.exact import (
-    LipschitzProof,
-    layer_weights,
-    lipschitz_lower,
-    lipschitz_upper,
-    prove_lipschitz,
-    solve_multipliers,
-)
+from torchrl_sspl.lipschitz.bounds import lipschitz_lower, lipschitz_upper
+from torchrl_sspl.lipschitz.exact import LipschitzProof, prove_lipschitz
 from torchrl_sspl.lipschitz.lmi import LMIBarrier
+from torchrl_sspl.lipschitz.multipliers import solve_multipliers
+from torchrl_sspl.lipschitz.network import layer_weights, slope_interval
 from torchrl_sspl.lipschitz.sandwich import SandwichBarrier, cayley
 
 __all__ = [
@@ -22,5 +18,6 @@ __all__ = [
     "lipschitz_lower",
     "lipschitz_upper",
     "prove_lipschitz",
+    "slope_interval",
     "solve_multipliers",
 ]

@@ -2,6 +2,7 @@ r"""The paper's barrier: a plain network that a log-determinant keeps inside the
 
 from __future__ import annotations
 
+import copy
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -11,6 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, NotPositiveDefiniteError, ShapeError
 from torchrl_sspl.functional import lmi_loss, lmi_matrix
+from torchrl_sspl.lipschitz.multipliers import norm_product, start_multipliers
 
 ACTIVATIONS: dict[str, tuple[Callable[[], nn.Module], tuple[float, float]]] = {
     "relu": (nn.ReLU, (0.0, 1.0)),
@@ -18,15 +20,15 @@ ACTIVATIONS: dict[str, tuple[Callable[[], nn.Module], tuple[float, float]]] = {
     "tanh": (nn.Tanh, (0.0, 1.0)),
     "softplus": (nn.Softplus, (0.0, 1.0)),
     "sigmoid": (nn.Sigmoid, (0.0, 0.25)),
+    "silu": (nn.SiLU, (-0.1, 1.1)),
 }
 
 
 class LMIBarrier(nn.Module):
     r"""Network with trainable multipliers whose matrix :math:`M(\theta, \Lambda)` stays positive definite.
 
-    It starts feasible: the weights are scaled so that :math:`\rho = \prod_k \|W_k\| \beta^l / L < 1`, and the
-    multipliers are :math:`\Lambda_{k+1} = a_{k+1} I` with :math:`a_0 = L^2`,
-    :math:`a_{k+1} = a_k \rho^{2/(l+1)} / (\beta \|W_k\|)^2`. Steps are taken through :meth:`backtracking_step`, which
+    It starts feasible: the weights are scaled so that :math:`\rho = \beta^l \prod_k \|W_k\| / L < 1`, and the
+    multipliers are those of :func:`~torchrl_sspl.lipschitz.multipliers.start_multipliers`. Steps are taken through :meth:`backtracking_step`, which
     never leaves the cone, so that the bound holds at every moment of the training.
 
     Args:
@@ -79,15 +81,12 @@ class LMIBarrier(nn.Module):
     @torch.no_grad()
     def _start(self) -> None:
         """Scales the weights and sets the multipliers so that the matrix is positive definite."""
-        weights, beta = self.weights(), self.slope[1]
-        count = len(weights)
-        product = beta ** (count - 1) * math.prod(float(torch.linalg.matrix_norm(w, 2)) for w in weights)
-        factor = (self.start_ratio * self.lipschitz_bound / product) ** (1.0 / count)
-        level = self.lipschitz_bound**2
+        weights = self.weights()
+        factor = (self.start_ratio * self.lipschitz_bound / norm_product(weights, self.slope)) ** (1.0 / len(weights))
         for weight in weights:
             weight.mul_(factor)
-        for weight, logs in zip(weights[:-1], self.log_multipliers, strict=True):
-            level *= self.start_ratio ** (2.0 / count) / (beta * float(torch.linalg.matrix_norm(weight, 2))) ** 2
+        levels = start_multipliers(weights, self.lipschitz_bound, self.slope)
+        for level, logs in zip(levels, self.log_multipliers, strict=True):
             logs.fill_(math.log(level))
 
     def reset_parameters(self) -> None:
@@ -120,8 +119,6 @@ class LMIBarrier(nn.Module):
     @torch.no_grad()
     def collapse(self) -> nn.Sequential:
         """A copy as a plain network."""
-        import copy
-
         return copy.deepcopy(self.net)
 
     @torch.no_grad()

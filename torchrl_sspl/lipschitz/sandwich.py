@@ -101,13 +101,14 @@ class SandwichBarrier(nn.Module):
         for zero in (*self.log_psi, *self.bias):
             zero.zero_()
 
-    def weights(self) -> list[Tensor]:
-        """Plain weights ``W_0 .. W_l``, each ``(out, in)``, differentiable."""
+    def weights(self, dtype: torch.dtype | None = None) -> list[Tensor]:
+        """Plain weights ``W_0 .. W_l``, each ``(out, in)``, differentiable; computed in ``dtype``."""
         halves = []
         for free, gain in zip(self.free, self.gain, strict=True):
-            orthogonal = cayley(gain * free / free.norm())
+            free = free.to(dtype or free.dtype)
+            orthogonal = cayley(gain.to(free) * free / free.norm())
             halves.append((orthogonal[:, : len(free)], orthogonal[:, len(free) :]))
-        psi = [p.exp() for p in self.log_psi]
+        psi = [p.to(dtype or p.dtype).exp() for p in self.log_psi]
         keep = 1.0 - _SHRINK
         outer = math.sqrt(2.0 * self.lipschitz_bound) * keep
         plain = [outer * halves[0][1] / psi[0][:, None]]
@@ -117,8 +118,8 @@ class SandwichBarrier(nn.Module):
         return plain
 
     def multipliers(self) -> list[Tensor]:
-        r"""Witness of the bound: :math:`\Lambda_k = L \Psi_k^2`, one vector per hidden layer."""
-        return [self.lipschitz_bound * (2.0 * p.detach()).exp() for p in self.log_psi]
+        r"""Witness of the bound: :math:`\Lambda_k = L \Psi_k^2`, one float64 vector per hidden layer."""
+        return [self.lipschitz_bound * (2.0 * p.detach().double()).exp() for p in self.log_psi]
 
     def forward(self, latent: Tensor) -> Tensor:
         """Barrier value ``(*batch, p) -> (*batch, 1)``."""
@@ -131,10 +132,13 @@ class SandwichBarrier(nn.Module):
 
     @torch.no_grad()
     def collapse(self) -> nn.Sequential:
-        """The same function as a plain network of linear layers and ReLU, float32, with copied weights."""
+        """The same function as a plain network of linear layers and ReLU; weights computed in float64, then rounded.
+
+        What the weights lose by rounding is below the slack of the certificate however large the parameters are.
+        """
         layers: list[nn.Module] = []
-        for weight, bias in zip(self.weights(), self.bias, strict=True):
-            linear = nn.Linear(weight.shape[1], weight.shape[0], device=weight.device, dtype=weight.dtype)
+        for weight, bias in zip(self.weights(torch.float64), self.bias, strict=True):
+            linear = nn.Linear(weight.shape[1], weight.shape[0], device=bias.device, dtype=bias.dtype)
             linear.weight.copy_(weight)
             linear.bias.copy_(bias)
             layers += [linear, nn.ReLU()]

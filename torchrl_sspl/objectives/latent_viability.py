@@ -177,13 +177,13 @@ def robust_invariant_set(
 def nearby_residuals(
     latent: Tensor, reference: Tensor, residual: Tensor, *, count: int, spread: float, neighbours: int = 64
 ) -> tuple[Tensor, Tensor]:
-    r"""Errors of the dynamics near every latent: a sample of them, and the ends of their principal axes.
+    r"""Errors of the dynamics near every latent: a sample of them, and the ends of their principal axis.
 
-    .. math:: \{ \mu \} \cup \{ \mu \pm s \sqrt{\lambda_j} v_j \}_{j = 1, 2}
+    .. math:: \{ \mu, \mu + s \sqrt{\lambda} v, \mu - s \sqrt{\lambda} v \}
 
-    with mean and leading eigenpairs of the covariance of the residuals of the nearest neighbours. The axes vary
-    smoothly with the latent, which a handful of sampled errors would not: an invariant set that has to tolerate
-    them has a smooth border.
+    with the mean and the leading eigenpair of the covariance of the residuals of the nearest neighbours. The axis
+    varies smoothly with the latent, which a handful of sampled errors would not: an invariant set that has to
+    tolerate it has a smooth border. What lies across the axis is left to the radius of the set.
 
     Args:
         latent: ``(n, p)``.
@@ -194,7 +194,7 @@ def nearby_residuals(
         neighbours: errors that make the covariance.
 
     Returns:
-        ``(n, count, p)`` samples and ``(n, j, p)`` ends of axes, j = 5 (3 if p is 1).
+        ``(n, count, p)`` samples and ``(n, 3, p)`` mean and ends of the axis.
 
     Source: none.
 
@@ -210,7 +210,7 @@ def nearby_residuals(
     mean = local.mean(1, keepdim=True)
     centred = local - mean
     values, vectors = torch.linalg.eigh(centred.mT @ centred / k)
-    axes = (vectors * values.clamp_min(0.0).sqrt()[:, None]).mT.flip(1)[:, :2] * spread
+    axes = (vectors * values.clamp_min(0.0).sqrt()[:, None]).mT[:, -1:] * spread
     return local[:, :count], torch.cat([mean, mean + axes, mean - axes], dim=1)
 
 

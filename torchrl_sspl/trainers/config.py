@@ -32,7 +32,7 @@ class NetworkConfig:
 
     latent_dim: int = 3
     lipschitz_bound: float = 2.0
-    barrier_hidden: list[int] = field(default_factory=lambda: [64, 64, 64])
+    barrier_hidden: list[int] = field(default_factory=lambda: [96, 96, 96])
     dynamics_hidden: list[int] = field(default_factory=lambda: [96, 96])
     policy_hidden: list[int] = field(default_factory=lambda: [48, 48])
     pool_to: int = 32
@@ -99,6 +99,7 @@ class SynthesisConfig:
         rounds: rounds of rollouts, refit, synthesis and fine-tuning; the first uses random-action data alone.
         transitions: encoded random-action transitions.
         rollout_transitions: transitions of the policy (with exploration) that every further round adds.
+        mined_unsafe: transitions from the rim of U, where the barrier is lowest, that every further round adds.
         exploration: standard deviation of the exploration, as a share of the largest action.
         dynamics_steps: optimiser steps of the refit of the latent dynamics.
         tube_radius: distance from the data up to which a latent off the manifold may belong to the safe set.
@@ -123,12 +124,13 @@ class SynthesisConfig:
     rounds: int = 3
     transitions: int = 40000
     rollout_transitions: int = 20000
+    mined_unsafe: int = 6000
     exploration: float = 0.15
     dynamics_steps: int = 6000
     tube_radius: float = 0.3
-    radius: float = 0.01
+    radius: float = 0.015
     residuals: int = 16
-    residual_spread: float = 2.5
+    residual_spread: float = 2.0
     actions: int = 21
     fit_steps: int = 4000
     steer_steps: int = 1000

@@ -317,7 +317,7 @@ def evaluate(
         )
     )
     out.add(Measurement("barrier_depth", float(-barrier.min()), "barrier", note="|min B| on the grid"))
-    out.arrays.update(states=states, latent=latent, barrier=barrier, viable=viable, unsafe=unsafe)
+    out.arrays.update(states=states, latent=latent, barrier=barrier, viability=kernel.interpolate(states), unsafe=unsafe)
 
     # Lipschitz constants.
     lower = lipschitz_lower(agent.barrier, -1.0, 1.0, n=20000, generator=generator)
@@ -396,7 +396,7 @@ def evaluate(
             "recoverable starts in U that end in {B<=0} and outside U",
         )
     )
-    out.arrays.update(recovery=episodes.states[:, :32], recovery_torques=episodes.actions[:, :32])
+    out.arrays.update(recovery=episodes.states[:, :32], recovery_torques=episodes.actions[:, :32], recovery_traces=episodes.barrier[:, :32])
     safe_starts = env.sample_states(n_back, generator=generator, region=env.safe_set)
     episodes = rollout(agent, env, safe_starts, config.horizon, draw=draw, progress=progress, label="episodes from S")
     touched = env.unsafe_set.contains(episodes.states).any(0)

@@ -38,7 +38,7 @@ from torchrl_sspl.objectives.latent_viability import (
     robust_invariant_set,
 )
 from torchrl_sspl.objectives.target import TargetLoss
-from torchrl_sspl.sets import SAFE, UNSAFE
+from torchrl_sspl.sets import SAFE, UNSAFE, Region
 from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
 
@@ -151,7 +151,9 @@ class SafePolicyTraining:
         self.checks: list[Check] = []
         self.phase, self.step, self.seconds = 0, 0, 0.0
         self._loop_state: dict[str, Any] | None = None
-        self._phase_rng: Tensor | None = None
+        self._target_round: int | None = None
+        self._target_table: TensorDict
+        self._rim: TensorDict
         self._last_checkpoint = time.monotonic()
         self._clock = time.monotonic()
         if resume and (self.out_dir / CHECKPOINT_FILE).is_file():
@@ -189,8 +191,6 @@ class SafePolicyTraining:
         while self.phase < len(phases):
             name, number = phases[self.phase]
             self._bar.set_description(f"{name} {number}" if name != "represent" else name)
-            if self._loop_state is None:
-                self._phase_rng = self.generator.get_state()
             getattr(self, f"_phase_{name}")(number)
             self._loop_state = None
             self.phase, self.step = self.phase + 1, 0
@@ -334,7 +334,14 @@ class SafePolicyTraining:
                 self._encoded(s.transitions // 2, seed + 3, region=self.env.unsafe_set),
             ]
         else:
-            parts = [self.latents, self._near_the_set(s.rollout_transitions, seed)]
+            # The rim of U is where a set goes wrong first, and uniform samples of U hardly ever lie there.
+            agent, generator = self._agent(0.0), torch.Generator().manual_seed(seed)
+            rim = _States(self._hardest_unsafe(agent, s.mined_unsafe, generator))
+            parts = [
+                self.latents,
+                self._near_the_set(s.rollout_transitions, seed),
+                self._encoded(s.mined_unsafe, seed + 50, region=rim),
+            ]
         self.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
 
     def _near_the_set(self, n: int, seed: int) -> dict[str, Tensor]:
@@ -358,6 +365,20 @@ class SafePolicyTraining:
             if count >= n:
                 break
         return {k: torch.cat([f[k] for f in found])[:n] for k in found[0]}
+
+    @torch.no_grad()
+    def _hardest_unsafe(self, agent: Agent, n: int, generator: torch.Generator) -> Tensor:
+        """States of U with the lowest barrier, found by repeated small moves from the lowest of uniform samples."""
+        env = self.env
+        spread = env.state_space.sample(2000, generator=generator).std(0) * 0.03
+        states = env.unsafe_set.sample(4 * n, generator=generator)
+        for _ in range(4):
+            value = agent.barrier(encode_states(agent, env, states))[:, 0]
+            states = states[value.topk(n // 2, largest=False).indices]
+            moved = env.wrap(states + spread * torch.randn(states.shape, generator=generator))
+            moved = moved[env.unsafe_set.contains(moved)]
+            states = torch.cat([states, moved])
+        return states
 
     def _phase_dynamics(self, number: int) -> None:
         """Dynamics on latents that stand still; off the manifold they lead back to it."""
@@ -464,7 +485,9 @@ class SafePolicyTraining:
         agent = self._agent(0.0)
         env, guard = self.env, 0.25 * s.margin
         n = s.check_episodes
-        unsafe = agent.barrier(encode_states(agent, env, env.unsafe_set.sample(10 * n, generator=generator)))[:, 0]
+        hardest = self._hardest_unsafe(agent, 4 * n, generator)
+        unsafe_states = torch.cat([env.unsafe_set.sample(4 * n, generator=generator), hardest])
+        unsafe = agent.barrier(encode_states(agent, env, unsafe_states))[:, 0]
         safe = agent.barrier(encode_states(agent, env, env.safe_set.sample(n, generator=generator)))[:, 0]
         states = self._buffer_region().sample(6 * n, generator=generator)
         value = agent.barrier(encode_states(agent, env, states))[:, 0]
@@ -532,7 +555,7 @@ class SafePolicyTraining:
 
     def _targets(self, number: int) -> tuple[TensorDict, TensorDict]:
         """Latents with the targets of barrier and policy, and the latents on which the condition is asked."""
-        if getattr(self, "_target_round", None) == number:
+        if self._target_round == number:
             return self._target_table, self._rim
         s, data = self.config.synthesis, self.latents
         g = torch.Generator().manual_seed(self.config.seed + 88_000 + number)
@@ -637,7 +660,7 @@ class SafePolicyTraining:
         net = self.config.network
         barrier = self.barrier.collapse()
         with torch.no_grad():
-            barrier[-1].bias -= level
+            barrier[-1].bias.sub_(level)  # type: ignore[operator, union-attr]
         return Agent(
             copy.deepcopy(self.encoder),
             copy.deepcopy(self.dynamics),
@@ -742,6 +765,16 @@ class SafePolicyTraining:
         self.generator.set_state(body["generator"])
         self.phase, self.step, self.seconds = body["phase"], body["step"], body["seconds"]
         self._loop_state = body["loop"]
+
+
+class _States(Region):
+    """A finite set of states as a region from which episodes can start."""
+
+    def __init__(self, states: Tensor) -> None:
+        self.states, self.dim = states, states.shape[1]
+
+    def sample(self, n: int, generator: torch.Generator | None = None, device: Any = None) -> Tensor:
+        return self.states[torch.randint(len(self.states), (n,), generator=generator)].to(device)
 
 
 class _Exploring:

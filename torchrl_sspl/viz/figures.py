@@ -15,6 +15,7 @@ from torchrl_sspl.viz.curves import training_curves
 from torchrl_sspl.viz.plane import (
     BARRIER_COLOUR,
     KERNEL_COLOUR,
+    OUTSIDE_FILL,
     PATH_COLOURS,
     POINTS,
     Plane,
@@ -111,12 +112,13 @@ def latent_space(
         border = np.nonzero(np.abs(value) <= near)[0]
         border = border[:: max(1, math.ceil(len(border) / max_points))]
     caption = "Latent points of S, U and the unlabelled buffer"
-    style = dict(s=5, c=BARRIER_COLOUR, marker=".", linewidths=0, label=f"|B| \u2264 {near:g}")
+    style = dict(s=11, c=BARRIER_COLOUR, marker="o", linewidths=0, zorder=5, label=f"|B| \u2264 {near:g}")
     if p == 3:
         require("mpl_toolkits.mplot3d")
         figure = new_figure(9.2, 4.6, f"{caption}, seen from two sides; black: the border of the learned safe set.")
         for k, azimuth in enumerate((-60, 30)):
             ax = figure.add_subplot(1, 2, k + 1, projection="3d")
+            ax.computed_zorder = False  # type: ignore[attr-defined]
             _scatter(ax, z[rows], codes[rows], depthshade=False)
             if len(border):
                 ax.scatter(*z[border].T, depthshade=False, **style)  # type: ignore[misc]
@@ -311,19 +313,23 @@ def trajectories(
     )
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
     ax = figure.add_subplot(grid[:, 0])
-    plane.draw(ax, cover=x[:, chosen][..., list(plane.coords)].reshape(-1, 2))
+    shown = x[:, chosen][..., list(plane.coords)].reshape(-1, 2)
+    plane.draw(ax, cover=shown)
     handles = plane.set_handles()
+    limits = [(plane.low[k] - 1e-4, plane.high[k] + 1e-4) for k in plane.coords]
+    if any(shown[:, k].min() < low or shown[:, k].max() > high for k, (low, high) in enumerate(limits)):
+        patch = require("matplotlib.patches").Patch
+        handles.append(patch(facecolor=OUTSIDE_FILL, edgecolor="#9a9a9a", linewidth=0.5, label="beyond the space"))
     if background is not None:
         gx, gy, table = plane.grid(background[0], {"barrier": background[1]})
         if zero_level(ax, gx, gy, table["barrier"], colors=BARRIER_COLOUR, linewidths=1.8, zorder=2):
             handles.append(_line(BARRIER_COLOUR, "B = 0"))
-    every = max(1, steps // arrows)
     marker = require("matplotlib.lines").Line2D
     for colour, k in zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True):
         path = x[:, k][:, list(plane.coords)]
         ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.2, zorder=3)
         ax.plot(*path[0], "o", color=colour, markersize=5, markeredgecolor="white", zorder=5)
-        at = _spaced(path / extent, every, 0.02)
+        at = _spaced(path / extent, arrows)
         along = _directions(path / extent, action_direction)
         length = (
             0.13 * extent * along * (u[:, k] if action_direction is not None else np.abs(u[:, k]))[:, None] / largest
@@ -348,7 +354,7 @@ def trajectories(
     handles.append(
         marker([], [], marker=arrow, color="#555555", linestyle="", markersize=9, label=f"{action_name}, size")
     )
-    figure.legend(handles=handles, loc="outside lower center", ncols=5, frameon=False)
+    figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
 
     time = np.arange(steps + 1) * (dt or 1.0)
     colours = list(zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True))
@@ -377,13 +383,12 @@ def _spread(points: np.ndarray, count: int) -> np.ndarray:
     return np.unique(chosen)
 
 
-def _spaced(path: np.ndarray, every: int, gap: float) -> np.ndarray:
-    """Steps at which an arrow is drawn: every so many, none where the path hardly moved since the last one."""
-    chosen = [0]
-    for t in range(every, len(path) - 1, every):
-        if np.abs(path[t] - path[chosen[-1]]).max() > gap:
-            chosen.append(t)
-    return np.array(chosen)
+def _spaced(path: np.ndarray, limit: int) -> np.ndarray:
+    """Steps at which an arrow is drawn: one per stretch of path, more often where the state moves fast."""
+    moved = np.linalg.norm(np.diff(path, axis=0), axis=1)
+    moved[moved > 0.5] = 0.0  # the step over the edge of a periodic coordinate
+    stretch = np.floor(np.concatenate([[0.0], moved[:-1].cumsum()]) / max(0.05, moved.sum() / limit))
+    return np.unique(stretch, return_index=True)[1]
 
 
 def _directions(path: np.ndarray, fixed: tuple[float, float] | None) -> np.ndarray:

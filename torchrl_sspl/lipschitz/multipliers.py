@@ -1,0 +1,196 @@
+r"""Multipliers :math:`\Lambda` with which the matrix of a Lipschitz certificate is positive definite."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sspl.functional import lmi_matrix
+from torchrl_sspl.lipschitz.network import Slope, layer_weights, slope_interval
+
+
+def norm_product(weights: Sequence[Tensor], slope: Slope = (0.0, 1.0)) -> float:
+    r"""Crude Lipschitz bound, :math:`\max(|\alpha|, |\beta|)^l \prod_k \|W_k\|_2`.
+
+    Args:
+        weights: :math:`W_0 .. W_l`, each ``(out, in)``.
+        slope: smallest and largest slope of the activation.
+
+    Returns:
+        The product.
+
+    Source: none.
+
+    Example:
+        >>> norm_product([torch.eye(2), torch.tensor([[3.0, 4.0]])])
+        5.0
+    """
+    steepest = max(abs(slope[0]), abs(slope[1]))
+    return steepest ** (len(weights) - 1) * math.prod(float(torch.linalg.matrix_norm(w.detach(), 2)) for w in weights)
+
+
+def start_multipliers(weights: Sequence[Tensor], lipschitz_bound: float, slope: Slope = (0.0, 1.0)) -> list[float]:
+    r"""Multiples of the identity that are feasible for a bound above the product of the norms.
+
+    .. math::
+        \Lambda_{k+1} = \frac{a_{k+1}}{1 - \alpha / \beta} I, \quad a_0 = L^2, \quad
+        a_{k+1} = a_k \frac{\rho^{2 / (l + 1)}}{(\beta \|W_k\|)^2}, \quad \rho = \beta^l \prod_k \|W_k\| / L < 1
+
+    for :math:`\alpha < \beta`, :math:`|\alpha| \le \beta`; slopes that are steeper below zero are reflected.
+
+    Args:
+        weights: :math:`W_0 .. W_l`, each ``(out, in)``.
+        lipschitz_bound: L, larger than :func:`norm_product`.
+        slope: smallest and largest slope of the activation.
+
+    Returns:
+        One number per hidden layer.
+
+    Source: none (Pauli et al. 2021 give no start).
+
+    Example:
+        >>> start_multipliers([torch.ones(1, 1), torch.ones(1, 1)], 2.0)
+        [2.0]
+    """
+    alpha, beta = slope if slope[1] >= -slope[0] else (-slope[1], -slope[0])
+    # A layer without weights costs nothing; a tiny norm in its place keeps the numbers finite.
+    norms = [max(float(torch.linalg.matrix_norm(w.detach(), 2)), 1e-6) for w in weights]
+    ratio = (beta ** (len(weights) - 1) * math.prod(norms) / lipschitz_bound) ** (2.0 / len(weights))
+    levels, level = [], lipschitz_bound**2
+    for norm in norms[:-1]:
+        level *= ratio / (beta * norm) ** 2
+        levels.append(level / (1.0 - alpha / beta))
+    return levels
+
+
+def minimise_bound(
+    weights: Sequence[Tensor], slope: Slope = (0.0, 1.0), *, target: float = 0.0, accuracy: float = 1e-7
+) -> tuple[list[Tensor], float]:
+    r"""Smallest provable bound, by Newton's method on :math:`t L^2 - \log\det M - \sum \log \lambda` for growing t.
+
+    M is linear in the multipliers and in :math:`L^2`, every multiplier entering with rank two, so that the Hessian is
+    a product of small matrices. Steps are shortened until they stay inside the cone: every iterate is feasible.
+
+    Args:
+        weights: :math:`W_0 .. W_l`, each ``(out, in)``, float64, at least two.
+        slope: smallest and largest slope of the activation.
+        target: stop as soon as the bound is below this.
+        accuracy: relative accuracy of :math:`L^2` at the end.
+
+    Returns:
+        Multipliers, one vector per hidden layer, and the bound that they make the matrix positive definite for.
+
+    Source: Fazlyab et al. 2019 (LipSDP-Neuron); the method is none of theirs.
+
+    Example:
+        >>> one = torch.ones(1, 1, dtype=torch.float64)
+        >>> round(minimise_bound([0.5 * one, one])[1], 3)
+        0.5
+    """
+    alpha, beta = slope
+    sizes = [weights[0].shape[1], *(w.shape[0] for w in weights)]
+    total, inputs, hidden = sum(sizes), sizes[0], sum(sizes[1:-1])
+    # M = constant + L^2 I at the input + sum_i lambda_i U_i K U_i^T, U_i = [row i of the weights, unit vector i].
+    before = torch.block_diag(*weights[:-1], weights[0].new_zeros(0, sizes[-2] + sizes[-1]))
+    pairs = torch.stack([before, torch.eye(total, dtype=torch.float64)[inputs : inputs + hidden]], 1)
+    kernel = torch.tensor([[2 * alpha * beta, -(alpha + beta)], [-(alpha + beta), 2.0]], dtype=torch.float64)
+    constant = torch.zeros(total, total, dtype=torch.float64)
+    constant[-sizes[-1] :, -sizes[-1] - sizes[-2] : -sizes[-1]] = -weights[-1]
+    constant = constant + constant.mT
+    constant[-sizes[-1] :, -sizes[-1] :] = torch.eye(sizes[-1], dtype=torch.float64)
+    first = torch.zeros(total, dtype=torch.float64)
+    first[:inputs] = 1.0
+
+    bound = 1.05 * max(norm_product(weights, slope), 1e-6)
+    levels = start_multipliers(weights, bound, slope)
+    lams = torch.cat([torch.full((n,), v, dtype=torch.float64) for n, v in zip(sizes[1:-1], levels, strict=True)])
+    # Unknowns relative to the start; a small cost keeps the multiplier of a unit without input from growing for ever.
+    scale = torch.cat([lams, torch.tensor([bound**2], dtype=torch.float64)])
+    cost = torch.cat([torch.full_like(lams, 1e-3), torch.zeros(1, dtype=torch.float64)])
+    x = torch.ones_like(scale)
+
+    def factor_at(point: Tensor) -> Tensor | None:
+        weighted = pairs * (point[:-1] * scale[:-1])[:, None, None]
+        matrix = constant + torch.diag(first * point[-1] * scale[-1])
+        matrix = matrix + torch.einsum("iak,ab,ibl->kl", weighted, kernel, pairs)
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        return None if int(info) or not bool((point > 0).all()) else factor
+
+    def value_at(point: Tensor, factor: Tensor) -> float:
+        return float(cost @ point - 2.0 * factor.diagonal().log().sum() - point[:-1].log().sum())
+
+    factor = factor_at(x)
+    if factor is None:
+        return list(lams.split(sizes[1:-1])), math.inf
+    weight, limit = float(total), 2.0 * (total + hidden) / accuracy
+    while weight < limit and math.sqrt(float(x[-1]) * scale[-1]) >= target:
+        cost[-1] = weight
+        for _ in range(50):
+            inverse = torch.cholesky_inverse(factor)
+            seen = torch.einsum("iak,kl,jbl->iajb", pairs, inverse, pairs)  # (hidden, 2, hidden, 2)
+            own = torch.einsum("iaib->iab", seen)
+            gradient, hessian = cost.clone(), torch.empty(hidden + 1, hidden + 1, dtype=torch.float64)
+            gradient[:-1] -= (own * kernel).sum((1, 2)) * scale[:-1] + 1.0 / x[:-1]
+            gradient[-1] -= inverse.diagonal()[:inputs].sum() * scale[-1]
+            across = torch.einsum("ab,ibjc->iajc", kernel, seen)
+            hessian[:-1, :-1] = torch.einsum("iajb,jbia->ij", across, across)
+            left = torch.einsum("iak,kl->ial", pairs, inverse[:, :inputs])
+            hessian[:-1, -1] = hessian[-1, :-1] = torch.einsum("ial,ab,ibl->i", left, kernel, left)
+            hessian[-1, -1] = inverse[:inputs, :inputs].square().sum()
+            hessian = hessian * scale[:, None] * scale + torch.diag(torch.cat([x[:-1] ** -2, x.new_zeros(1)]))
+            root, info = torch.linalg.cholesky_ex(hessian)
+            if int(info):
+                break
+            step = -torch.cholesky_solve(gradient[:, None], root)[:, 0]
+            decrement = float(-(gradient @ step))
+            if not decrement > 1e-2:
+                break
+            size, value = 1.0, value_at(x, factor)
+            while size > 1e-8:
+                trial = factor_at(x + size * step)
+                if trial is not None and value_at(x + size * step, trial) < value - 0.1 * size * decrement:
+                    x, factor = x + size * step, trial
+                    break
+                size *= 0.5
+            else:
+                break  # as accurate as float64 allows
+        weight *= 8.0
+    return list((x[:-1] * scale[:-1]).split(sizes[1:-1])), math.sqrt(float(x[-1] * scale[-1]))
+
+
+def solve_multipliers(
+    network: nn.Module | Sequence[Tensor], slope: Slope | None = None, *, lipschitz_bound: float | None = None
+) -> list[Tensor] | None:
+    """Multipliers with which the matrix of a claimed bound is positive definite, or None.
+
+    A barrier that knows its own is believed after a look; for other networks an interior-point method finds them.
+
+    Args:
+        network: plain network or its weights.
+        slope: smallest and largest slope of the activation; read from the network if not given.
+        lipschitz_bound: the claimed constant; without it, the multipliers of the smallest provable one.
+
+    Returns:
+        One positive vector per hidden layer, float64; None if the claimed constant has none.
+
+    Source: paper Lemma 2.
+
+    Example:
+        >>> weights = [torch.tensor([[0.5], [0.5]]), torch.tensor([[1.0, 1.0]])]
+        >>> solve_multipliers(weights, lipschitz_bound=0.9) is None, len(solve_multipliers(weights))
+        (True, 1)
+    """
+    slope = slope_interval(network, slope)
+    weights = [w.double() for w in layer_weights(network)]
+    if lipschitz_bound is not None and callable(getattr(network, "multipliers", None)):
+        own = [m.detach().double() for m in network.multipliers()]  # type: ignore[union-attr, operator]
+        if not int(torch.linalg.cholesky_ex(lmi_matrix(weights, own, lipschitz_bound, slope)).info):
+            return own
+    if len(weights) == 1:
+        return []
+    target = 0.0 if lipschitz_bound is None else lipschitz_bound * (1 - 1e-9)
+    found, bound = minimise_bound(weights, slope, target=target)
+    return found if lipschitz_bound is None or bound <= lipschitz_bound else None
