@@ -307,7 +307,7 @@ def trajectories(
     extent = np.array([plane.high[k] - plane.low[k] for k in plane.coords])
     chosen = _spread(x[0][:, list(plane.coords)] / extent, min(episodes, n))
     largest = action_scale or max(float(np.abs(u).max()), 1e-12)
-    size = f"; the longest arrow is {largest:.3g} in {action_name}"
+    size = f"; the longest arrow is {largest:.3g} ({action_name})"
     figure = new_figure(
         10.5, 5.0, (caption or f"{len(chosen)} trajectories of the learned policy").rstrip(".") + size + "."
     )
