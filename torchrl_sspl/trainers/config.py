@@ -124,7 +124,7 @@ class SynthesisConfig:
     rounds: int = 3
     transitions: int = 40000
     rollout_transitions: int = 20000
-    mined_unsafe: int = 6000
+    mined_unsafe: int = 8000
     exploration: float = 0.15
     dynamics_steps: int = 6000
     tube_radius: float = 0.3
@@ -139,7 +139,7 @@ class SynthesisConfig:
     band: float = 0.1
     batch: int = 1024
     lr: float = 1e-3
-    unsafe_margin: float = 0.03
+    unsafe_margin: float = 0.05
     deviation_coeff: float = 0.01
     recovery_coeff: float = 0.3
     check_episodes: int = 1500

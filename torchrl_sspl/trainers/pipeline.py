@@ -432,6 +432,9 @@ class SafePolicyTraining:
         s = self.config.synthesis
         table, rim = self._targets(number)
         unsafe = (table["region"][:, 0] == UNSAFE).nonzero()[:, 0]
+        # Half of the rows of U come from its rim, the sixth that lies nearest to the set.
+        nearest = table["barrier_target"][unsafe, 0].argsort()[: max(1, len(unsafe) // 6)]
+        rim_of_unsafe = unsafe[nearest]
         safe = (table["region"][:, 0] == SAFE).nonzero()[:, 0]
         table = table.clone(False)
         outside_weight = table["action_weight"] * torch.where(table["inside"], 0.1, 1.0)
@@ -455,17 +458,19 @@ class SafePolicyTraining:
             outside_cap=s.band,
             policy_coeff=s.recovery_coeff,
             safety_margin=s.unsafe_margin,
-            unsafe_coeff=3.0,
+            inside_coeff=2.0,
+            unsafe_coeff=10.0,
             safe_coeff=1.0,
-            worst_coeff=0.3,
-            worst_fraction=0.05,
+            worst_coeff=1.0,
+            worst_fraction=0.02,
         )
 
         def step() -> TensorDict:
             rows = torch.cat(
                 [
                     self._pick(len(table), s.batch),
-                    unsafe[self._pick(len(unsafe), s.batch)],
+                    unsafe[self._pick(len(unsafe), s.batch // 2)],
+                    rim_of_unsafe[self._pick(len(rim_of_unsafe), s.batch // 2)],
                     safe[self._pick(len(safe), s.batch // 4)],
                 ]
             )
