@@ -37,6 +37,12 @@ def test_arc_that_ends_at_pi_holds_both_names_of_its_end():
     ]
 
 
+def test_rounding_of_a_turn_does_not_push_an_end_out():
+    arc = Box([-1.0], [1.0], period=[TURN])
+    ends = [end + turns * TURN for end in (-1.0, 1.0) for turns in range(-20, 21)]
+    assert all(contains(arc, *ends))
+
+
 def test_arc_across_pi_is_one_piece():
     assert contains(Box([3.0], [3.5], period=[TURN]), 3.1, -3.1, -math.pi, 3.5 - TURN, -2.7, 2.9) == [
         True, True, True, True, False, False,
