@@ -6,6 +6,7 @@ import json
 
 import pytest
 import torch
+from tiny import TINY
 
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError
@@ -13,16 +14,6 @@ from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.trainers.config import make_config
 from torchrl_sspl.trainers.evaluation import evaluate
 from torchrl_sspl.trainers.pipeline import CHECKPOINT_FILE, Check, SafePolicyTraining
-
-TINY = [
-    "preset=smoke", "progress=false", "checkpoint_seconds=0",
-    "data.transitions=64", "data.safe=16", "data.unsafe=16", "representation.steps=3", "representation.batch=24",
-    "synthesis.rounds=2", "synthesis.transitions=240", "synthesis.rollout_transitions=24",
-    "synthesis.dynamics_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=3", "synthesis.tune_steps=3",
-    "synthesis.check_episodes=8", "synthesis.check_horizon=2", "synthesis.batch=32", "synthesis.residuals=2",
-    "network.barrier_hidden=[8,8]", "network.dynamics_hidden=[8]", "network.policy_hidden=[8]",
-]
-
 
 def make_env(batch_size: list[int], seed: int) -> PendulumEnv:
     return PendulumEnv(batch_size=batch_size, seed=seed)
@@ -54,7 +45,7 @@ def uninterrupted(tmp_path_factory):
     return path, training(path).run()
 
 
-@pytest.mark.parametrize("checkpoints", [1, 2, 4, 9, 13, 17])
+@pytest.mark.parametrize("checkpoints", [1, 4, 9, 13])
 def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkpoints):
     Interrupted.after = checkpoints
     with pytest.raises(Killed):

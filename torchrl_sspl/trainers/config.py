@@ -121,7 +121,7 @@ class SynthesisConfig:
         check_horizon: steps of each.
     """
 
-    rounds: int = 3
+    rounds: int = 2
     transitions: int = 40000
     rollout_transitions: int = 20000
     mined_unsafe: int = 8000
