@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import numpy as np
 
@@ -67,3 +68,35 @@ def minus_log_det(matrix):
 
 def covering_radius(points, samples):
     return max(min(math.dist(z, s) for s in samples) for z in points)
+
+
+def is_positive_definite(weights, multipliers, bound, slope):
+    """Decides M > 0 by the pivots of an exact LDL^T in fractions."""
+    def to_fractions(m):
+        return np.array([[Fraction(float(v)) for v in row] for row in m], dtype=object)
+
+    alpha, beta = map(Fraction, slope)
+    sizes = [weights[0].shape[1]] + [w.shape[0] for w in weights]
+    edges = [sum(sizes[:k]) for k in range(len(sizes) + 1)]
+    m = np.array([[Fraction(0)] * edges[-1] for _ in range(edges[-1])], dtype=object)
+    for i in range(sizes[0]):
+        m[i, i] += Fraction(bound) ** 2
+    for i in range(edges[-2], edges[-1]):
+        m[i, i] += 1
+    for k, (w, lam) in enumerate(zip(weights[:-1], multipliers, strict=True)):
+        w = to_fractions(w)
+        for i, value in enumerate(lam):
+            here, value, before = edges[k + 1] + i, Fraction(float(value)), slice(edges[k], edges[k + 1])
+            m[here, here] += 2 * value
+            m[here, before] -= (alpha + beta) * value * w[i]
+            m[before, here] -= (alpha + beta) * value * w[i]
+            m[before, before] += 2 * alpha * beta * value * np.outer(w[i], w[i])
+    last, hidden, out = to_fractions(weights[-1]), slice(edges[-3], edges[-2]), slice(edges[-2], edges[-1])
+    m[out, hidden] -= last
+    m[hidden, out] -= last.T
+    for i in range(len(m)):
+        if m[i, i] <= 0:
+            return False
+        for j in range(i + 1, len(m)):
+            m[j, i:] = m[j, i:] - m[j, i] / m[i, i] * m[i, i:]
+    return True
