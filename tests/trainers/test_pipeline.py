@@ -15,6 +15,7 @@ from torchrl_sspl.trainers.config import make_config
 from torchrl_sspl.trainers.evaluation import evaluate
 from torchrl_sspl.trainers.pipeline import CHECKPOINT_FILE, Check, SafePolicyTraining
 
+
 def make_env(batch_size: list[int], seed: int) -> PendulumEnv:
     return PendulumEnv(batch_size=batch_size, seed=seed)
 
