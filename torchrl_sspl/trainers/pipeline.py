@@ -488,7 +488,7 @@ class SafePolicyTraining:
         s, seed = self.config.synthesis, self.config.seed + 500_000 + 1000 * number
         generator = torch.Generator().manual_seed(seed)
         agent = self._agent(0.0)
-        env, guard = self.env, 0.25 * s.margin
+        env, guard = self.env, 0.5 * s.margin
         n = s.check_episodes
         hardest = self._hardest_unsafe(agent, 4 * n, generator)
         unsafe_states = torch.cat([env.unsafe_set.sample(4 * n, generator=generator), hardest])
