@@ -17,14 +17,14 @@ def total(terms):
     return sum(value for key, value in terms.items() if key.startswith("loss_"))
 
 
-def main(batches: int = 12, updates: int = 20, seed: int = 0, loop: bool = False) -> dict[str, float]:
+def main(batches: int = 12, updates: int = 32, seed: int = 0, loop: bool = False) -> dict[str, float]:
     torch.manual_seed(seed)
     env = PendulumEnv(batch_size=[64], image_size=32, horizon=5, seed=seed)
     env.initial_set = env.safe_set | env.state_space  # half of the episodes start in S
     salad = SaLaD.from_sizes(latent_dim=3, action_dim=1, action_scale=env.max_action)
     policy = Policy(latent_dim=3, action_dim=1, action_scale=env.max_action)
     loss = SSPLLoss(*salad, policy, successor="target")  # preset "sound", delayed barrier for successors
-    optimizer = torch.optim.Adam(loss.parameters(), lr=2e-3)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     updater = SoftUpdate(loss, tau=0.05)
     buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8192), batch_size=64)
     frames = {"frames_per_batch": 640, "total_frames": 640 * batches, "init_random_frames": 1280}
