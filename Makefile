@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: pendulum test lint docs clean
+.PHONY: pendulum test clean
 
 pendulum: $(VENV)/.viz
 	$(BIN)/python examples/inverted_pendulum.py $(ARGS)
@@ -13,9 +13,6 @@ test: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -m "not slow and not gpu and not ray"
-
-docs: $(VENV)/.docs
-	$(BIN)/mkdocs build --strict
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
