@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import math
 import sys
 from pathlib import Path
@@ -149,6 +150,34 @@ def test_witness_that_is_not_positive_is_refused(value):
     proof = prove_lipschitz([torch.eye(2), torch.ones(1, 2)], 5.0, multipliers=[torch.tensor([1.0, value])])
     assert not proof.proved
     assert "positive and finite" in proof.reason
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_smallest_bound_is_found_for_multipliers_of_unlike_sizes(seed):
+    torch.manual_seed(seed)
+    barrier = SandwichBarrier(2, (32, 32, 32), 2.0)
+    with torch.no_grad():
+        for p in barrier.log_psi:
+            p.normal_(std=1.5)
+    weights = barrier.weights(torch.float64)
+    with torch.no_grad():  # the same function from rows of unlike scale: the bound does not change
+        weights[0][:16] *= 0.05
+        weights[1][:, :16] /= 0.05
+    upper = lipschitz_upper(weights)
+    assert upper == pytest.approx(lipschitz_upper(barrier), rel=1e-5)
+    assert upper <= 2.0
+
+
+def test_collapsed_weights_are_rounded_from_double_precision():
+    torch.manual_seed(0)
+    barrier = SandwichBarrier(2, (16, 16), 2.0)
+    with torch.no_grad():
+        for g in barrier.gain:
+            g.mul_(100.0)
+    deployed, precise = barrier.collapse(), copy.deepcopy(barrier).double().weights()
+    layers = [m for m in deployed if isinstance(m, nn.Linear)]
+    assert all(m.weight.dtype == torch.float32 for m in layers)
+    assert all(torch.equal(m.weight, w.detach().float()) for m, w in zip(layers, precise, strict=True))
 
 
 def test_constant_network_has_a_tiny_bound():

@@ -72,7 +72,7 @@ def minimise_bound(
     r"""Smallest provable bound, by Newton's method on :math:`t L^2 - \log\det M - \sum \log \lambda` for growing t.
 
     M is linear in the multipliers and in :math:`L^2`, every multiplier entering with rank two, so that the Hessian is
-    a product of small matrices. Steps are shortened until they stay inside the cone: every iterate is feasible.
+    a product of small matrices. Every iterate is feasible.
 
     Args:
         weights: :math:`W_0 .. W_l`, each ``(out, in)``, float64, at least two.
@@ -91,6 +91,7 @@ def minimise_bound(
         0.5
     """
     alpha, beta = slope
+    weights, units = _balanced(weights)
     sizes = [weights[0].shape[1], *(w.shape[0] for w in weights)]
     total, inputs, hidden = sum(sizes), sizes[0], sum(sizes[1:-1])
     # M = constant + L^2 I at the input + sum_i lambda_i U_i K U_i^T, U_i = [row i of the weights, unit vector i].
@@ -112,23 +113,18 @@ def minimise_bound(
     cost = torch.cat([torch.full_like(lams, 1e-3), torch.zeros(1, dtype=torch.float64)])
     x = torch.ones_like(scale)
 
-    def factor_at(point: Tensor) -> Tensor | None:
+    def part(point: Tensor) -> Tensor:
+        """What the unknowns contribute to M."""
         weighted = pairs * (point[:-1] * scale[:-1])[:, None, None]
-        matrix = constant + torch.diag(first * point[-1] * scale[-1])
-        matrix = matrix + torch.einsum("iak,ab,ibl->kl", weighted, kernel, pairs)
-        factor, info = torch.linalg.cholesky_ex(matrix)
-        return None if int(info) or not bool((point > 0).all()) else factor
+        return torch.einsum("iak,ab,ibl->kl", weighted, kernel, pairs) + torch.diag(first * point[-1] * scale[-1])
 
-    def value_at(point: Tensor, factor: Tensor) -> float:
-        return float(cost @ point - 2.0 * factor.diagonal().log().sum() - point[:-1].log().sum())
-
-    factor = factor_at(x)
-    if factor is None:
-        return list(lams.split(sizes[1:-1])), math.inf
+    factor, info = torch.linalg.cholesky_ex(constant + part(x))
+    if int(info):
+        return [torch.ones_like(d) for d in units], math.inf
     weight, limit = float(total), 2.0 * (total + hidden) / accuracy
-    while weight < limit and math.sqrt(float(x[-1]) * scale[-1]) >= target:
+    while weight < limit and math.sqrt(float(x[-1] * scale[-1])) >= target:
         cost[-1] = weight
-        for _ in range(50):
+        for _ in range(30):
             inverse = torch.cholesky_inverse(factor)
             seen = torch.einsum("iak,kl,jbl->iajb", pairs, inverse, pairs)  # (hidden, 2, hidden, 2)
             own = torch.einsum("iaib->iab", seen)
@@ -141,24 +137,54 @@ def minimise_bound(
             hessian[:-1, -1] = hessian[-1, :-1] = torch.einsum("ial,ab,ibl->i", left, kernel, left)
             hessian[-1, -1] = inverse[:inputs, :inputs].square().sum()
             hessian = hessian * scale[:, None] * scale + torch.diag(torch.cat([x[:-1] ** -2, x.new_zeros(1)]))
-            root, info = torch.linalg.cholesky_ex(hessian)
+            spread = hessian.diagonal().rsqrt()
+            root, info = torch.linalg.cholesky_ex(hessian * spread[:, None] * spread)
+            if int(info):
+                break  # as accurate as float64 allows
+            step = -spread * torch.cholesky_solve((spread * gradient)[:, None], root)[:, 0]
+            if not float(-(gradient @ step)) > 1e-2:
+                break
+            # Along the step the function is linear minus logarithms of 1 + s e: its minimum is found exactly. No step
+            # goes near the boundary of the cone, where Newton's method would creep.
+            half = torch.linalg.solve_triangular(factor, part(step), upper=False)
+            rates = torch.linalg.eigvalsh(torch.linalg.solve_triangular(factor, half.mT, upper=False))
+            rates = torch.cat([rates, step[:-1] / x[:-1]])
+            size = min(_line_minimum(float(cost @ step), rates), 0.6 / max(-float(rates.min()), 1e-3))
+            moved = x + size * step
+            trial, info = torch.linalg.cholesky_ex(constant + part(moved))
             if int(info):
                 break
-            step = -torch.cholesky_solve(gradient[:, None], root)[:, 0]
-            decrement = float(-(gradient @ step))
-            if not decrement > 1e-2:
-                break
-            size, value = 1.0, value_at(x, factor)
-            while size > 1e-8:
-                trial = factor_at(x + size * step)
-                if trial is not None and value_at(x + size * step, trial) < value - 0.1 * size * decrement:
-                    x, factor = x + size * step, trial
-                    break
-                size *= 0.5
-            else:
-                break  # as accurate as float64 allows
-        weight *= 8.0
-    return list((x[:-1] * scale[:-1]).split(sizes[1:-1])), math.sqrt(float(x[-1] * scale[-1]))
+            x, factor = moved, trial
+        weight *= 4.0
+    found = (x[:-1] * scale[:-1]).split(sizes[1:-1])
+    return [m * d**2 for m, d in zip(found, units, strict=True)], math.sqrt(float(x[-1] * scale[-1]))
+
+
+def _balanced(weights: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    r"""Weights in units of the hidden states in which what enters a unit is as large as what leaves it.
+
+    M in these units is congruent to M, with multipliers :math:`\Lambda / d^2`: only the numbers get better.
+    """
+    weights = list(weights)
+    units = [torch.ones(w.shape[0], dtype=w.dtype) for w in weights[:-1]]
+    for _ in range(10):
+        for k, d in enumerate(units):
+            into, out = weights[k].norm(dim=1), weights[k + 1].norm(dim=0)
+            ratio = torch.where((into > 0) & (out > 0), (out / into).sqrt(), torch.ones_like(d))
+            weights[k], weights[k + 1], units[k] = weights[k] * ratio[:, None], weights[k + 1] / ratio, d * ratio
+    return weights, units
+
+
+def _line_minimum(slope: float, rates: Tensor) -> float:
+    r"""Minimum over s > 0 of :math:`c s - \sum_i \log(1 + s e_i)`, convex, by bisection of its derivative."""
+    low, high = 0.0, 1.0 / max(-float(rates.min()), 1e-3)
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        if slope < float((rates / (1.0 + middle * rates)).sum()):
+            low = middle
+        else:
+            high = middle
+    return low
 
 
 def solve_multipliers(
