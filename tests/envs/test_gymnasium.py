@@ -1,0 +1,157 @@
+"""Foreign environments through their own pictures: frames, labels, actions, seeds, and what is refused."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict
+from torchrl.envs.utils import check_env_specs
+
+from torchrl_sspl.data import collect_random
+from torchrl_sspl.envs.gymnasium import GymnasiumPixels
+from torchrl_sspl.errors import ConfigError, OverlapError
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+
+
+class Slider(gymnasium.Env):
+    """A white column on black moves by the action; state and info tell where it is."""
+
+    render_mode = "rgb_array"
+    observation_space = spaces.Box(-50, 50, (1,), np.float64)
+
+    def __init__(self, action_space=None, lifetime: int = 10**6) -> None:
+        self.action_space = action_space or spaces.Box(0.0, 4.0, (1,), np.float32)
+        self.lifetime, self.actions = lifetime, []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x, self.age = float(self.np_random.integers(4, 12)), 0
+        self.x = (options or {}).get("x", self.x)
+        return np.array([self.x]), {"x": self.x}
+
+    def step(self, action):
+        self.actions.append(action)
+        self.x, self.age = float(np.clip(self.x + float(np.sum(action)) - 2, 0, 15)), self.age + 1
+        return np.array([self.x]), self.x, self.age >= self.lifetime, False, {"x": self.x}
+
+    def render(self):
+        picture = np.zeros((32, 32, 3), np.uint8)
+        at = 2 * round(self.x)
+        picture[:, at : at + 2] = 255
+        return picture
+
+
+def slider(n=2, *, make=Slider, **options):
+    options = {"safe": lambda state, info: info["x"] < 5, "unsafe": lambda state, info: state[0] > 10, **options}
+    return GymnasiumPixels(make, batch_size=[n], image_size=16, **{"seed": 0, **options})
+
+
+def position(frame: torch.Tensor) -> torch.Tensor:
+    return frame.float().mean((-3, -2)).argmax(-1)
+
+
+def test_specs_hold():
+    check_env_specs(slider())
+    sets = {"safe": lambda state, info: abs(state[2]) < 0.05, "unsafe": lambda state, info: abs(state[2]) > 0.1}
+    check_env_specs(slider(1, make=lambda: gymnasium.make("CartPole-v1", render_mode="rgb_array"), **sets))
+
+
+def test_second_frame_shows_now_and_first_frame_shows_one_step_before():
+    data = slider(3).rollout(6, break_when_any_done=False)
+    now = position(data["next", "pixels"][:, :, 3:])
+    assert torch.equal(now, data["next", "state"][..., 0].round().long())
+    assert torch.equal(data["next", "pixels"][:, :, :3], data["pixels"][:, :, 3:])
+
+
+def test_labels_follow_the_predicates_on_info_and_on_state():
+    env = slider(1)
+    for x, region in ((2.0, SAFE), (7.0, UNLABELLED), (13.0, UNSAFE)):
+        env.reset_options = {"x": x}
+        assert env.reset()["region"].item() == region
+
+
+def test_first_frames_show_the_motion_of_one_step():
+    env = slider(1, reset_options={"x": 6.0}, make=lambda: Slider(spaces.Box(0.0, 10.0, (1,), np.float32)))
+    pixels = env.reset()["pixels"][0]
+    assert (position(pixels[:3]).item(), position(pixels[3:]).item()) == (6, 9)  # middle action 5, less 2
+
+
+def test_reset_options_may_be_drawn():
+    env = slider(4, reset_options=lambda random: {"x": float(random.integers(0, 3))})
+    assert env.reset()["state"].max() <= 3
+    assert len({env.reset()["state"].sum().item() for _ in range(8)}) > 1
+
+
+def test_actions_are_distances_from_the_middle_of_the_box_and_clamped():
+    env = slider(1)
+    env.reset()
+    for action, native in ((0.0, 2.0), (-2.0, 0.0), (1.5, 3.5), (99.0, 4.0)):
+        env.step(TensorDict(action=torch.tensor([[action]]), batch_size=[1]))
+        assert env._envs[0].actions[-1] == pytest.approx(native)
+    assert env.max_action == 2.0
+
+
+def test_components_keep_their_own_ranges():
+    env = slider(1, make=lambda: Slider(spaces.Box(np.array([0.0, -1.0]), np.array([4.0, 1.0]), dtype=np.float64)))
+    assert env.max_action == [2.0, 1.0]
+    assert env.action_spec.space.high.tolist() == [[2.0, 1.0]]
+
+
+@pytest.mark.parametrize(("action", "choice"), [(-1.0, 5), (-0.4, 5), (-0.2, 6), (0.2, 6), (0.4, 7), (1.0, 7), (9.0, 7)])
+def test_discrete_actions_cut_the_interval_into_equal_parts(action, choice):
+    env = slider(1, make=lambda: Slider(spaces.Discrete(3, start=5)))
+    env.reset()
+    env.step(TensorDict(action=torch.tensor([[action]]), batch_size=[1]))
+    assert env._envs[0].actions[-1] == choice
+
+
+def test_same_seed_gives_the_same_episodes_and_another_seed_others():
+    store = [collect_random(slider(2), 40, seed=seed, steps=5).get(slice(None))["frames"] for seed in (3, 3, 4)]
+    assert torch.equal(store[0], store[1])
+    assert not torch.equal(store[0], store[2])
+
+
+def test_horizon_truncates_and_gymnasium_terminates():
+    data = slider(1, horizon=4).rollout(10)
+    assert data["next", "truncated"].flatten().tolist() == [False] * 3 + [True]
+    data = slider(1, make=lambda: Slider(lifetime=4)).rollout(10)
+    assert data["next", "terminated"].flatten().tolist() == [False, False, True]  # one step has passed in the reset
+
+
+def test_ended_environments_restart_alone():
+    env = slider(2)
+    env.reset()
+    steps = env.step(TensorDict(action=torch.ones(2, 1), batch_size=[2]))["next"]
+    steps["_reset"] = torch.tensor([[False], [True]])
+    again = env.reset(steps)
+    assert torch.equal(again["pixels"][0], steps["pixels"][0])
+    assert env._steps == [1, 0]
+
+
+def test_what_cannot_work_is_refused():
+    with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
+        slider(make=lambda: gymnasium.make("CartPole-v1"))
+    with pytest.raises(ConfigError, match="finite bounds"):
+        slider(make=lambda: Slider(spaces.Box(-np.inf, np.inf, (1,), np.float32)))
+    with pytest.raises(ConfigError, match="finite bounds"):
+        slider(make=lambda: Slider(spaces.MultiBinary(3)))
+    with pytest.raises(OverlapError, match="exclude each other"):
+        slider(unsafe=lambda state, info: True, reset_options={"x": 1.0}).reset()
+    with pytest.raises(ConfigError, match="survives one step"):
+        slider(make=lambda: Slider(lifetime=1)).reset()
+    with pytest.raises(ConfigError, match="batch_size"):
+        slider(0)
+    with pytest.raises(ConfigError, match="horizon"):
+        slider(horizon=0)
+    with pytest.raises(ConfigError, match="image_size"):
+        GymnasiumPixels(Slider, safe=bool, unsafe=bool, image_size=2)
+
+
+def test_an_observation_that_is_no_vector_is_left_out():
+    class Picture(Slider):
+        observation_space = spaces.Box(0, 255, (4, 4, 3), np.uint8)
+
+    assert "state" not in slider(make=Picture).observation_spec

@@ -1,0 +1,263 @@
+"""Any gymnasium environment that can draw itself, as a TorchRL environment with two stacked frames and regions."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
+from torch.nn import functional as F
+from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from torchrl_sspl.errors import ConfigError, OverlapError
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+
+Predicate = Callable[[Any, Mapping[str, Any]], Any]
+_ATTEMPTS = 20
+
+
+class GymnasiumPixels(EnvBase):
+    r"""A gymnasium environment seen through its own pictures, labelled by two predicates.
+
+    The networks see pixels only. The predicates see what gymnasium returns, its observation and its info, and
+    are asked after every step; what neither of them claims is unlabelled. Output keys, for ``batch_size=[n]``:
+
+    ========== ============================ ==============================================================
+    key        shape, dtype                 meaning
+    ========== ============================ ==============================================================
+    pixels     ``(n, 6, H, W)`` uint8       RGB frame of step t-1, then RGB frame of step t
+    region     ``(n, 1)`` int64             0 unlabelled, 1 safe, 2 unsafe
+    state      ``(n, k)`` float32           gymnasium's observation, only where that is a vector
+    reward     ``(n, 1)`` float32           gymnasium's reward
+    terminated ``(n, 1)`` bool              gymnasium's, and ``truncated``: gymnasium's or ``horizon``
+    ========== ============================ ==============================================================
+
+    Actions lie in a box around zero. For a ``Box`` of gymnasium the action is the distance from its middle, in its
+    own units: :math:`u_{gym} = (low + high) / 2 + u`. For ``Discrete(k)`` the interval [-1, 1] is cut into k equal
+    parts, in the order of gymnasium's numbers.
+
+    A reset is followed by one step with the action zero, so that the two first frames show motion.
+
+    Args:
+        make: ``() -> gymnasium.Env`` with ``render_mode="rgb_array"``; called n times.
+        safe: ``(observation, info) -> bool``, the set S.
+        unsafe: ``(observation, info) -> bool``, the set U.
+        batch_size: ``[n]`` environments, stepped one after the other.
+        image_size: height and width of the frames, in pixels; pictures are averaged down to it.
+        horizon: steps after which an episode is truncated; ``None`` leaves that to gymnasium.
+        reset_options: ``options`` of gymnasium's reset, or ``(numpy generator) -> options``.
+        device: device of the tensors.
+        seed: seed of the resets.
+
+    Raises:
+        ConfigError: the environment cannot draw itself, or its action space is neither a bounded ``Box`` nor
+            ``Discrete``.
+        OverlapError: during a run, if both predicates claim a state.
+
+    Source: none; the paper has two systems of its own.
+
+    Example:
+        >>> import gymnasium
+        >>> env = GymnasiumPixels(
+        ...     lambda: gymnasium.make("CartPole-v1", render_mode="rgb_array"), batch_size=[2], image_size=32, seed=0,
+        ...     safe=lambda state, info: abs(state[2]) < 0.05, unsafe=lambda state, info: abs(state[2]) > 0.15)
+        >>> env.rollout(3)["pixels"].shape
+        torch.Size([2, 3, 6, 32, 32])
+        >>> env.max_action
+        1.0
+        >>> env.close()
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], Any],
+        *,
+        safe: Predicate,
+        unsafe: Predicate,
+        batch_size: Sequence[int] = (1,),
+        image_size: int = 64,
+        horizon: int | None = None,
+        reset_options: Mapping[str, Any] | Callable[[np.random.Generator], Mapping[str, Any]] | None = None,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+    ) -> None:
+        size = torch.Size([batch_size]) if isinstance(batch_size, int) else torch.Size(batch_size)
+        if len(size) != 1 or size[0] < 1:
+            raise ConfigError(f"batch_size: expected [n] with n >= 1, received {list(size)}.")
+        if horizon is not None and horizon < 1:
+            raise ConfigError(f"horizon: expected an integer >= 1 or None, received {horizon!r}.")
+        if not isinstance(image_size, int) or image_size < 8:
+            raise ConfigError(f"image_size: expected an integer >= 8, received {image_size!r}.")
+        super().__init__(device=torch.device(device or "cpu"), batch_size=size)
+        os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+        self.image_size, self.horizon, self.reset_options = image_size, horizon, reset_options
+        self._safe, self._unsafe = safe, unsafe
+        self._envs = [make() for _ in range(size[0])]
+        first = self._envs[0]
+        if getattr(first, "render_mode", None) != "rgb_array":
+            raise ConfigError(
+                f"make: expected an environment with render_mode='rgb_array', received "
+                f"{getattr(first, 'render_mode', None)!r}; give it to gymnasium.make."
+            )
+        self._read_action_space(first.action_space)
+        shape = getattr(first.observation_space, "shape", None)
+        self.state_dim = shape[0] if shape is not None and len(shape) == 1 else 0
+        self._make_specs()
+        self._random = np.random.default_rng(seed)
+        n = size[0]
+        self._frame = torch.zeros(n, 3, image_size, image_size, dtype=torch.uint8)
+        self._steps = [0] * n
+        self._last: list[dict[str, Any]] = [{} for _ in range(n)]
+
+    # -- spaces ----------------------------------------------------------------------------------------
+
+    def _read_action_space(self, space: Any) -> None:
+        self._choices: int | None = None
+        if hasattr(space, "n") and hasattr(space, "start"):
+            self._choices, self._start = int(space.n), int(space.start)
+            self.action_dim, self._scale, self._middle = 1, np.ones(1, np.float32), np.zeros(1, np.float32)
+        elif hasattr(space, "low") and np.isfinite(space.low).all() and np.isfinite(space.high).all():
+            self._action_shape, self._action_dtype = space.shape, space.dtype
+            low, high = space.low.reshape(-1).astype(np.float32), space.high.reshape(-1).astype(np.float32)
+            self.action_dim, self._scale, self._middle = len(low), (high - low) / 2, (high + low) / 2
+        else:
+            raise ConfigError(
+                f"action_space: expected Discrete or a Box with finite bounds, received {space}; wrap the environment, "
+                "for example in gymnasium.wrappers.RescaleAction."
+            )
+
+    @property
+    def max_action(self) -> float | list[float]:
+        """Largest absolute action, a number where all components share it; what ``action_scale`` wants."""
+        scale = self._scale.tolist()
+        return scale[0] if len(set(scale)) == 1 else scale
+
+    def _native_action(self, action: np.ndarray) -> Any:
+        """Action of gymnasium for an action ``(action_dim,)``; beyond the bounds it is clamped to them."""
+        bounded = np.clip(action, -self._scale, self._scale)
+        if self._choices is not None:
+            part = int((float(bounded[0]) + 1.0) / 2.0 * self._choices)
+            return self._start + min(part, self._choices - 1)
+        return (self._middle + bounded).reshape(self._action_shape).astype(self._action_dtype)
+
+    def _make_specs(self) -> None:
+        shape, device, size = self.batch_size, self.device, self.image_size
+        entries: dict[str, Any] = {
+            "pixels": Bounded(0, 255, shape=(*shape, 6, size, size), dtype=torch.uint8, device=device),
+            "region": Categorical(3, shape=(*shape, 1), dtype=torch.int64, device=device),
+        }
+        if self.state_dim:
+            entries["state"] = Unbounded(shape=(*shape, self.state_dim), dtype=torch.float32, device=device)
+        self.observation_spec = Composite(entries, shape=shape, device=device)
+        high = torch.tensor(self._scale, device=device).expand(*shape, self.action_dim).clone()
+        self.action_spec = Bounded(-high, high, shape=high.shape, dtype=torch.float32, device=device)
+        self.reward_spec = Unbounded(shape=(*shape, 1), dtype=torch.float32, device=device)
+        flag = Binary(shape=(*shape, 1), dtype=torch.bool, device=device)
+        self.done_spec = Composite(
+            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=device
+        )
+
+    # -- one environment -------------------------------------------------------------------------------
+
+    def _draw(self, index: int) -> Tensor:
+        picture = np.array(self._envs[index].render())  # a copy: some renderers draw into the same memory again
+        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
+            raise ConfigError(
+                f"render: expected a uint8 picture (height, width, 3), received {picture.dtype} {picture.shape}."
+            )
+        frame = torch.from_numpy(picture).permute(2, 0, 1)
+        if frame.shape[1:] != (self.image_size, self.image_size):
+            averaged = F.interpolate(frame[None].float(), size=(self.image_size, self.image_size), mode="area")[0]
+            frame = averaged.add_(0.5).clamp_(0, 255).to(torch.uint8)
+        return frame
+
+    def _region(self, observation: Any, info: Mapping[str, Any]) -> int:
+        safe, unsafe = bool(self._safe(observation, info)), bool(self._unsafe(observation, info))
+        if safe and unsafe:
+            raise OverlapError(
+                "safe and unsafe: expected predicates that exclude each other, received a state that both claim; "
+                "make one of them smaller."
+            )
+        return SAFE if safe else UNSAFE if unsafe else UNLABELLED
+
+    def _restart(self, index: int) -> Tensor:
+        """Reset one environment and let one step pass; returns the frame of the reset."""
+        env = self._envs[index]
+        for _ in range(_ATTEMPTS):
+            options = self.reset_options(self._random) if callable(self.reset_options) else self.reset_options
+            seed = int(self._random.integers(2**31 - 1))
+            env.reset(seed=seed, options=None if options is None else dict(options))
+            before = self._draw(index)
+            observation, _, terminated, truncated, info = env.step(self._native_action(np.zeros(self.action_dim)))
+            if not (terminated or truncated):
+                break
+        else:
+            raise ConfigError(
+                f"reset: expected an episode that survives one step, received {_ATTEMPTS} that did not; change reset_options."
+            )
+        self._frame[index] = self._draw(index)
+        self._steps[index] = 0
+        self._last[index] = self._row(observation, info)
+        return before
+
+    def _row(self, observation: Any, info: Mapping[str, Any]) -> dict[str, Any]:
+        row: dict[str, Any] = {"region": self._region(observation, info)}
+        if self.state_dim:
+            row["state"] = np.asarray(observation, np.float32)
+        return row
+
+    # -- TorchRL ---------------------------------------------------------------------------------------
+
+    def _set_seed(self, seed: int | None) -> None:
+        self._random = np.random.default_rng(seed)
+
+    def _reset(self, tensordict: TensorDictBase | None, **_: Any) -> TensorDictBase:
+        rows = list(range(self.batch_size[0]))
+        if tensordict is not None and "_reset" in tensordict:
+            chosen = tensordict["_reset"].reshape(-1).tolist()
+            rows = [k for k in rows if chosen[k]]
+        previous = self._frame.clone()
+        for k in rows:
+            previous[k] = self._restart(k)
+        return self._output(previous)
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict["action"].detach().cpu().reshape(-1, self.action_dim).numpy()
+        previous, self._frame = self._frame, torch.empty_like(self._frame)
+        rewards, ended, cut = [], [], []
+        for k, env in enumerate(self._envs):
+            observation, reward, terminated, truncated, info = env.step(self._native_action(actions[k]))
+            self._frame[k] = self._draw(k)
+            self._steps[k] += 1
+            self._last[k] = self._row(observation, info)
+            rewards.append(float(reward))
+            ended.append(bool(terminated))
+            cut.append(bool(truncated) or (self.horizon is not None and self._steps[k] >= self.horizon))
+        out = self._output(previous)
+        terminated, truncated = (torch.tensor(v, device=self.device)[:, None] for v in (ended, cut))
+        out["reward"] = torch.tensor(rewards, device=self.device)[:, None]
+        out["terminated"], out["truncated"], out["done"] = terminated, truncated, terminated | truncated
+        return out
+
+    def _output(self, previous: Tensor) -> TensorDict:
+        entries = {
+            "pixels": torch.cat([previous, self._frame], dim=1),
+            "region": torch.tensor([row["region"] for row in self._last])[:, None],
+        }
+        if self.state_dim:
+            entries["state"] = torch.from_numpy(np.stack([row["state"] for row in self._last]))
+        return TensorDict(entries, batch_size=self.batch_size).to(self.device)
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """Close the environments of gymnasium too."""
+        for env in self._envs:
+            env.close()
+        super().close(raise_if_closed=raise_if_closed)
+
+
+__all__ = ["GymnasiumPixels"]
