@@ -409,7 +409,8 @@ class _Problem:
 def _outside(region: Region, state: Tensor) -> Tensor:
     """How far states ``(n, d)`` are outside a region, largest-component norm; negative inside; ``(n,)``.
 
-    A lower bound of the distance for boxes and what is cut out of or joined from them; +-1 for other regions.
+    A lower bound of the distance for boxes and what is cut out of or joined from them; what ``region.outside`` says
+    for a region that has it; +-1 for other regions.
     """
     if isinstance(region, Box):
         low, high, period = region.low.to(state), region.high.to(state), region.period.to(state)
@@ -423,6 +424,8 @@ def _outside(region: Region, state: Tensor) -> Tensor:
         return torch.maximum(_outside(region.a, state), -_outside(region.b, state))
     if isinstance(region, Union):
         return torch.stack([_outside(part, state) for part in region.parts]).amin(0)
+    if hasattr(region, "outside"):
+        return region.outside(state)
     return 1.0 - 2.0 * region.contains(state).to(state.dtype)
 
 

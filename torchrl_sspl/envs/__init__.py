@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.dubins import DubinsEnv
+from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.envs.pendulum import PendulumEnv
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
 
-__all__ = ["GymnasiumRenderer", "PendulumEnv", "PendulumRenderer", "SafetyEnv"]
+__all__ = ["DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "PendulumEnv", "PendulumRenderer", "SafetyEnv"]

@@ -1,0 +1,261 @@
+"""The walking robot of the paper's second case study as a Dubins car, seen from above."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
+from torchrl_sspl.envs.quadruped.compositor import TopViewCompositor
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.sets import SAFE, Box, Region
+
+OBSTACLE_SHAPES = ("square", "disc")
+YAW_LAG = (0.048, 0.063)
+"""Turn of the walking robot in one step per yaw rate commanded now and one step before, in s."""
+
+
+class Disc(Region):
+    r"""States whose first two coordinates lie in a disc, :math:`\|(x, y) - c\| \le r`.
+
+    Args:
+        centre (sequence of float): (x, y) in m.
+        radius (float): in m.
+        rest (Box, optional): values of the other coordinates when states are drawn; membership does not depend on
+            them. Default None: the states are (x, y).
+
+    Raises:
+        ConfigError: the radius is not positive.
+
+    Source: none.
+
+    Example:
+        >>> Disc([0.0, 0.0], 1.0).contains(torch.tensor([[0.6, 0.6], [0.8, 0.8]]))
+        tensor([ True, False])
+    """
+
+    def __init__(self, centre: Sequence[float], radius: float, rest: Box | None = None) -> None:
+        check_positive(radius=radius)
+        self.centre, self.radius, self.rest = torch.tensor([float(v) for v in centre]), float(radius), rest
+        self.dim = 2 if rest is None else 2 + rest.dim
+
+    def outside(self, state: Tensor) -> Tensor:
+        """Distance in m to the disc, negative inside, ``(*batch, dim) -> (*batch,)``."""
+        return (state[..., :2] - self.centre.to(state)).norm(dim=-1) - self.radius
+
+    def contains(self, state: Tensor) -> Tensor:
+        """Whether states belong to the set; arguments as for ``Region.contains``."""
+        check_tensor("state", state, self.dim)
+        return self.outside(state) <= 0
+
+    def sample(
+        self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None
+    ) -> Tensor:
+        """Uniform states of the set; arguments as for ``Region.sample``."""
+        u = torch.rand(n, 2, generator=generator, device=device)
+        angle, distance = 2 * math.pi * u[:, :1], self.radius * u[:, 1:].sqrt()
+        place = self.centre.to(u) + distance * torch.cat([angle.cos(), angle.sin()], -1)
+        return place if self.rest is None else torch.cat([place, self.rest.sample(n, generator, device)], -1)
+
+
+class DubinsEnv(SafetyEnv):
+    r"""Batched robots that walk at constant speed past an obstacle, with two stacked top views as observation.
+
+    With position (x, y), heading theta and the commanded yaw rate u, one step is
+
+        x' = x + v cos(theta) dt,    y' = y + v sin(theta) dt,    theta' = theta + u dt
+
+    Regions, in (m, m, rad), for the default sizes: X = [-2, 2]^2 x [-pi, pi], U = [-0.7, 0.7]^2 x [-pi, pi],
+    S = X without (-1.5, 1.5)^2 x [-pi, pi]. A robot that leaves X ends the episode and counts as safe: at constant
+    speed it has to leave. What stands on the ground is smaller than U, because the feet reach farther than the
+    middle of the robot. Output keys: see ``SafetyEnv``.
+
+    The walking robot turns later than it is told to. With ``yaw_lag=(a, b)`` the heading follows
+
+        theta' = theta + a u_t + b u_{t-1}
+
+    and (x, y, theta) alone does not determine what comes next: the state is then (x, y, theta, u_{t-1}), of
+    dimension 4. Two frames show the turn of the last step, a mixture of the last two commands; they do not
+    determine u_{t-1}.
+
+    The pictures show a robot at some phase of its gait. The phase is not part of the state: it is a fixed,
+    irregular function of the state that takes all values, so that whoever learns from the frames has to disregard it
+    and the same state always gives the same frame.
+
+    Args:
+        batch_size (sequence of int): ``[n]`` robots, or ``[]`` for one. Default ``[1]``.
+        max_yaw_rate (float): bound of ``|u|`` in rad/s. Default 2.
+        speed (float): v in m/s. Default 1.
+        dt (float): time step in s. Default 0.1.
+        image_size (int): height and width of the frames. Default 128.
+        arena_half_size, safe_half_size, unsafe_half_size (float): in m; X is a square around the origin, S lies
+            outside and U inside a square (U: a disc for ``obstacle_shape="disc"``) around the obstacle. Default
+            2, 1.5, 0.7.
+        obstacle_shape (str): ``"square"`` (default) or ``"disc"``.
+        obstacle_half_size (float): half of the edge, or the radius, of what stands on the ground, in m. Default 0.3.
+        obstacle_centre (sequence of float): (x, y) of the obstacle in m. Default the origin.
+        yaw_lag (sequence of float, optional): (a, b) in s, see above; ``YAW_LAG`` is what was measured on the walking
+            robot. Default None: a = dt, b = 0.
+        horizon (int, optional): steps after which an episode is truncated. Default None: never.
+        initial_set (Region, optional): where episodes start. Default all of X.
+        device, seed: device, and seed of the environment's own random generator.
+
+    Raises:
+        ConfigError: an unknown shape, a size or rate that is not positive, sizes that are not in order.
+
+    Source: paper, Section IV-B. Deviation: leaving the arena is defined (the paper's formula has no answer); the
+    optional yaw lag.
+
+    Example:
+        >>> import torch
+        >>> env = DubinsEnv(batch_size=[2], max_yaw_rate=2.0, seed=0)
+        >>> env.dynamics(torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([[2.0]]))
+        tensor([[1.1000, 1.0000, 0.2000]])
+        >>> env.observe(torch.tensor([[1.0, 1.0, 0.0]])).shape
+        torch.Size([1, 6, 128, 128])
+    """
+
+    def __init__(
+        self,
+        batch_size: Sequence[int] = (1,),
+        max_yaw_rate: float = 2.0,
+        *,
+        speed: float = 1.0,
+        dt: float = 0.1,
+        image_size: int = 128,
+        arena_half_size: float = 2.0,
+        safe_half_size: float = 1.5,
+        unsafe_half_size: float = 0.7,
+        obstacle_shape: str = "square",
+        obstacle_half_size: float = 0.3,
+        obstacle_centre: Sequence[float] = (0.0, 0.0),
+        yaw_lag: Sequence[float] | None = None,
+        horizon: int | None = None,
+        initial_set: Region | None = None,
+        device: torch.device | str | None = None,
+        seed: int | None = None,
+    ) -> None:
+        if obstacle_shape not in OBSTACLE_SHAPES:
+            raise ConfigError(
+                f"obstacle_shape: expected one of {list(OBSTACLE_SHAPES)}, received {obstacle_shape!r}."
+            )
+        check_positive(
+            max_yaw_rate=max_yaw_rate,
+            speed=speed,
+            dt=dt,
+            arena_half_size=arena_half_size,
+            safe_half_size=safe_half_size,
+            unsafe_half_size=unsafe_half_size,
+            obstacle_half_size=obstacle_half_size,
+        )
+        centre = [float(v) for v in obstacle_centre]
+        if len(centre) != 2 or not all(abs(v) <= arena_half_size for v in centre):
+            raise ConfigError(f"obstacle_centre: expected (x, y) inside the arena, received {list(obstacle_centre)}.")
+        if not obstacle_half_size <= unsafe_half_size < safe_half_size < arena_half_size + max(map(abs, centre)):
+            raise ConfigError(
+                "sizes: expected obstacle <= unsafe < safe < arena, received "
+                f"{obstacle_half_size}, {unsafe_half_size}, {safe_half_size}, {arena_half_size}."
+            )
+        if yaw_lag is not None and (len(yaw_lag) != 2 or not all(math.isfinite(v) for v in yaw_lag)):
+            raise ConfigError(f"yaw_lag: expected two finite numbers (a, b) in s or None, received {yaw_lag!r}.")
+        turn = 2 * math.pi
+        # Coordinates other than the position: heading, and with a lag the last command.
+        low, high, period = [-math.pi], [math.pi], [turn]
+        if yaw_lag is not None:
+            low, high, period = [*low, -max_yaw_rate], [*high, max_yaw_rate], [*period, 0.0]
+
+        def square(half: float, middle: Sequence[float]) -> Box:
+            x, y = middle
+            return Box([x - half, y - half, *low], [x + half, y + half, *high], period=[0.0, 0.0, *period])
+
+        space = square(arena_half_size, (0.0, 0.0))
+        unsafe, obstacle = self._obstacle(obstacle_shape, centre, unsafe_half_size, obstacle_half_size, square)
+        super().__init__(
+            state_dim=len(low) + 2,
+            action_dim=1,
+            max_action=max_yaw_rate,
+            safe_set=space - square(safe_half_size, centre),
+            unsafe_set=unsafe,
+            state_space=space,
+            exit_region=SAFE,
+            initial_set=initial_set,
+            batch_size=batch_size,
+            image_size=image_size,
+            horizon=horizon,
+            device=device,
+            seed=seed,
+        )
+        self.max_yaw_rate, self.speed, self.dt = float(max_yaw_rate), float(speed), float(dt)
+        self.yaw_lag = None if yaw_lag is None else (float(yaw_lag[0]), float(yaw_lag[1]))
+        self.obstacle_shape, self.obstacle_half_size = obstacle_shape, float(obstacle_half_size)
+        self.obstacle_centre, self.arena_half_size = (centre[0], centre[1]), float(arena_half_size)
+        # Robots a little outside the arena are still seen.
+        self._compositor = TopViewCompositor(
+            image_size, obstacle=obstacle, half_view=1.2 * arena_half_size, device=self.device
+        )
+
+    @staticmethod
+    def _obstacle(shape, centre, unsafe_half_size, half_size, square) -> tuple[Region, Region]:
+        """The unsafe set in state space, and what stands on the ground in the plane."""
+        box = square(unsafe_half_size, centre)
+        x, y = centre
+        if shape == "disc":
+            rest = Box(box.low[2:], box.high[2:], period=box.period[2:].tolist())
+            return Disc(centre, unsafe_half_size, rest), Disc(centre, half_size)
+        return box, Box([x - half_size, y - half_size], [x + half_size, y + half_size])
+
+    def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
+        """One step of the robot; the formula is in the class docstring.
+
+        Args:
+            state (Tensor): ``(*batch, 3)`` (m, m, rad), floating point; with a yaw lag ``(*batch, 4)``, the last
+                entry being the command of the step before in rad/s.
+            action (Tensor): ``(*batch, 1)`` yaw rate in rad/s; clamped to ``max_yaw_rate``.
+
+        Returns:
+            Tensor: of the shape of ``state``; the heading is not wrapped, see ``wrap``.
+
+        Raises:
+            ShapeError, DTypeError, NonFiniteError: an argument is not a finite tensor of the expected shape.
+
+        Source: paper, Section IV-B. Deviation: the optional yaw lag.
+        """
+        check_tensor("state", state, self.state_dim)
+        action = self.clamp_action(action)
+        heading, step = state[..., 2:3], self.speed * self.dt
+        moved = state[..., :2] + step * torch.cat([heading.cos(), heading.sin()], -1)
+        if self.yaw_lag is None:
+            return torch.cat([moved, heading + self.dt * action], -1)
+        now, before = self.yaw_lag
+        return torch.cat([moved, heading + now * action + before * state[..., 3:], action.expand_as(heading)], -1)
+
+    def wrap(self, state: Tensor) -> Tensor:
+        """State with its heading in [-pi, pi), same shape."""
+        heading = torch.remainder(state[..., 2:3] + math.pi, 2 * math.pi) - math.pi
+        return torch.cat([state[..., :2], heading, state[..., 3:]], -1)
+
+    def previous_state(self, state: Tensor) -> Tensor:
+        """State one step earlier of a robot that was walking straight ahead, same shape.
+
+        The yaw rate of the last step cannot be told from the state: it moves the previous frame by at most
+        ``v dt`` times the turn of one step, 2 cm for the default sizes.
+        """
+        check_tensor("state", state, self.state_dim)
+        heading, step = state[..., 2:3], self.speed * self.dt
+        before = state[..., :2] - step * torch.cat([heading.cos(), heading.sin()], -1)
+        return torch.cat([before, heading, torch.zeros_like(state[..., 3:])], -1)
+
+    def gait_phase(self, state: Tensor) -> Tensor:
+        """Phase of the gait in which a state is drawn, ``(*batch, state_dim) -> (*batch,)`` in [0, 1)."""
+        mixed = 43.7585 * state[..., 0] + 78.233 * state[..., 1] + 27.619 * state[..., 2].sin()
+        return mixed.remainder(1.0)
+
+    def draw(self, state: Tensor) -> Tensor:
+        """RGB frames of states, ``(*batch, state_dim) -> uint8 (*batch, 3, H, W)``."""
+        return self._compositor(state[..., :3], self.gait_phase(state))
+
+
+__all__ = ["OBSTACLE_SHAPES", "YAW_LAG", "Disc", "DubinsEnv"]
