@@ -11,12 +11,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+from torchrl_sspl import functional
 from torchrl_sspl.certification.ground_truth import ViabilityKernel, recoverable_set, viability_kernel
 from torchrl_sspl.certification.statistics import clopper_pearson
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules.agent import Agent
-from torchrl_sspl.sets import Region
+from torchrl_sspl.sets import SAFE, Region
 from torchrl_sspl.trainers.config import EvaluationConfig
 
 CONFIDENCE = 0.95
@@ -183,6 +184,9 @@ def rollout(
 ) -> Rollouts:
     """Runs the agent's policy from given states, all episodes side by side.
 
+    Where leaving the state space counts as safe, whoever has left it stands still from then on, with barrier value
+    -1 and without error: nothing is asked of it any more.
+
     Args:
         agent: frozen agent.
         env: gives dynamics and pictures.
@@ -201,14 +205,23 @@ def rollout(
     state = start
     latent = observer.start(env.previous_state(start), start)
     states, actions, barrier, errors, barrier_errors = [start], [], [agent.barrier(latent)[:, 0]], [], []
+    exit_is_safe = env.exit_region == SAFE
     for _ in tqdm(range(horizon), desc=label, disable=not progress, leave=False):
         action = agent.policy(latent)
-        state = env.wrap(env.dynamics(state, action))
+        moved = env.wrap(env.dynamics(state, action))
+        if exit_is_safe:
+            moved = torch.where(env.state_space.contains(state)[:, None], moved, state)
+        state = moved
         predicted = agent.dynamics(latent, action)
         latent = observer.next(state)
         value = agent.barrier(latent)[:, 0]
-        errors.append((predicted - latent).norm(dim=-1))
-        barrier_errors.append(value - agent.barrier(predicted)[:, 0])
+        error, barrier_error = (predicted - latent).norm(dim=-1), value - agent.barrier(predicted)[:, 0]
+        if exit_is_safe:
+            gone = ~env.state_space.contains(state)
+            value = value.masked_fill(gone, -1.0)
+            error, barrier_error = error.masked_fill(gone, 0.0), barrier_error.masked_fill(gone, 0.0)
+        errors.append(error)
+        barrier_errors.append(barrier_error)
         states.append(state)
         actions.append(action)
         barrier.append(value)
@@ -343,6 +356,24 @@ def evaluate(
         "uniform states and actions",
     )
 
+    # The paper's margins, and how far the conditions hold with them.
+    fresh = see(env.sample_states(5000, generator=generator))
+    nearest = torch.cat([torch.cdist(part, latent).amin(1) for part in fresh.split(_CHUNK)])
+    note = f"fresh latents to the nearest of {len(latent)} latents of the grid; not a covering radius of all observations"
+    _quantiles(out, "covering_radius", nearest, "latent", note)
+    error = _held_out_error(agent, env, observer, inside, generator)
+    psi = functional.safety_margin(agent.lipschitz_bound, float(nearest.max()), mode="paper").q1
+    eta = functional.dynamics_margin(agent.lipschitz_bound, float(error.max()) if len(error) else math.nan)
+    out.add(Measurement("safety_margin", psi, "barrier", len(fresh), note="psi* = L_B eps-bar"))
+    out.add(Measurement("dynamics_margin", eta, "barrier", len(error), note="eta* = L_B delta, held-out steps of the policy"))
+    q3 = agent.barrier(agent.dynamics(latent, agent.policy(latent)))[:, 0][member]
+    for name, met, what in (
+        ("q1_with_margin", safe_barrier + psi <= 0, "B + psi* <= 0 on S"),
+        ("q2_with_margin", barrier[unsafe] - psi >= 0, "B - psi* >= 0 on U"),
+        ("q3_with_margin", q3 + psi + eta <= 0, "B(d(z, pi(z))) + psi* + eta* <= 0 on {B<=0}"),
+    ):
+        out.add(share(name, int(met.sum()), len(met), what))
+
     # Episodes from the learned safe set.
     starts = _sample_where(inside, env.state_space, n_rollouts, generator)
     if len(starts):
@@ -409,6 +440,18 @@ def evaluate(
         )
     )
     return out
+
+
+def _held_out_error(
+    agent: Agent, env: SafetyEnv, observer: _Observer, inside: Callable[[Tensor], Tensor], generator: torch.Generator
+) -> Tensor:
+    """Errors of the latent dynamics on single steps of the policy from the set, ``(n,)``."""
+    start = _sample_where(inside, env.state_space, 5000, generator)
+    if not len(start):
+        return torch.zeros(0)
+    z = observer.start(env.previous_state(start), start)
+    action = agent.policy(z)
+    return (agent.dynamics(z, action) - observer.next(env.wrap(env.dynamics(start, action)))).norm(dim=-1)
 
 
 def _quantiles(out: Evaluation, name: str, values: Tensor, unit: str, note: str) -> None:
