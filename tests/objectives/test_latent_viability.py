@@ -23,17 +23,17 @@ LINE = torch.linspace(-0.995, 0.995, 399)[:, None]  # a point every 0.005
 RIM = torch.cat([torch.linspace(-2.0, -1.0, 201), torch.linspace(1.0, 2.0, 201)])[:, None]
 
 
-# The distance to a cloud of points is positive between two of them: only a radius above half their spacing tells
-# inside from outside.
-SMALL = 0.006
-
-
 def unstable(z: Tensor) -> Tensor:
     return 1.5 * z[:, None] + ACTIONS[None, :, None]
 
 
-def reach(radius: float, residuals: Tensor | None = None) -> float:
-    found = robust_invariant_set(unstable(LINE), LINE, RIM, radius=radius, residuals=residuals)
+def errors(size: float) -> Tensor:
+    """Errors of both signs at every point of the line."""
+    return torch.tensor([[size], [-size]]).expand(len(LINE), 2, 1)
+
+
+def reach(residuals: Tensor | None = None) -> float:
+    found = robust_invariant_set(unstable(LINE), LINE, RIM, residuals=residuals)
     inside = LINE[found.inside, 0]
     assert len(inside), "the set is empty"
     assert float(inside.min()) == pytest.approx(-float(inside.max()), abs=1e-4)
@@ -42,74 +42,85 @@ def reach(radius: float, residuals: Tensor | None = None) -> float:
 
 
 def test_unstable_line_can_be_held_up_to_its_known_border():
-    assert reach(SMALL) == pytest.approx(0.4, abs=0.025)
+    assert reach() == pytest.approx(0.4, abs=0.011)
 
 
-@pytest.mark.parametrize("radius", [0.02, 0.05, 0.1])
-def test_radius_costs_what_the_mathematics_says(radius):
-    # Held if 1.5 z - 0.2 + radius < z, up to the spacing of the points.
-    assert reach(radius) == pytest.approx((0.2 - radius) / 0.5, abs=0.016)
+@pytest.mark.parametrize("error", [0.02, 0.05, 0.1])
+def test_error_costs_what_the_mathematics_says(error):
+    # Held if 1.5 z - 0.2 + error < z, up to the spacing of the points.
+    assert reach(errors(error)) == pytest.approx((0.2 - error) / 0.5, abs=0.016)
 
 
-def test_larger_radius_gives_a_smaller_set():
-    sets = [robust_invariant_set(unstable(LINE), LINE, RIM, radius=r).inside for r in (SMALL, 0.03, 0.06, 0.1)]
+def test_larger_error_gives_a_smaller_set():
+    sets = [robust_invariant_set(unstable(LINE), LINE, RIM, residuals=errors(e)).inside for e in (0.0, 0.03, 0.06, 0.1)]
     for larger, smaller in zip(sets[:-1], sets[1:], strict=True):
         assert bool((smaller <= larger).all())
         assert int(smaller.sum()) < int(larger.sum())
 
 
-def test_radius_beyond_the_control_leaves_nothing():
-    assert not bool(robust_invariant_set(unstable(LINE), LINE, RIM, radius=0.3).inside.any())
-
-
-@pytest.mark.parametrize("error", [0.02, 0.05])
-def test_residuals_of_both_signs_cost_as_much_as_a_radius(error):
-    both = torch.tensor([[error], [-error]]).expand(len(LINE), 2, 1)
-    assert reach(SMALL, both) == pytest.approx(reach(SMALL + error), abs=0.011)
+def test_error_beyond_the_control_leaves_nothing():
+    assert not bool(robust_invariant_set(unstable(LINE), LINE, RIM, residuals=errors(0.3)).inside.any())
 
 
 def test_residual_on_one_side_moves_the_set_and_does_not_shrink_it():
     # z+ = 1.5 z + u + 0.05 is the same system around z = -0.1.
     offset = torch.full((len(LINE), 1, 1), 0.05)
-    found = robust_invariant_set(unstable(LINE), LINE, RIM, radius=SMALL, residuals=offset)
+    found = robust_invariant_set(unstable(LINE), LINE, RIM, residuals=offset)
     inside = LINE[found.inside, 0]
-    assert float(inside.min()) == pytest.approx(-0.5, abs=0.025)
-    assert float(inside.max()) == pytest.approx(0.3, abs=0.025)
+    assert float(inside.min()) == pytest.approx(-0.5, abs=0.016)
+    assert float(inside.max()) == pytest.approx(0.3, abs=0.016)
 
 
-@pytest.mark.parametrize("radius", [SMALL, 0.05])
-def test_every_point_of_the_set_has_an_action_that_keeps_clear_of_everything_else(radius):
-    found = robust_invariant_set(unstable(LINE), LINE, RIM, radius=radius)
+@pytest.mark.parametrize("error", [0.0, 0.05])
+def test_every_point_of_the_set_has_an_action_that_stays_in_it_and_its_clearance(error):
+    found = robust_invariant_set(unstable(LINE), LINE, RIM, residuals=errors(error))
     complement = torch.cat([RIM, LINE[~found.inside]])
     best = found.clearance[found.inside].max(1)
-    assert bool((best.values > radius).all())
+    assert bool((best.values > 0).all())
     after = unstable(LINE)[found.inside][torch.arange(len(best.indices)), best.indices]
-    torch.testing.assert_close(nearest_distance(after, complement), best.values)
+    worst = torch.minimum(nearest_distance(after + error, complement), nearest_distance(after - error, complement))
+    torch.testing.assert_close(worst, best.values)
+    ends = torch.cat([after + error, after - error])
+    assert bool((nearest_distance(ends, LINE[found.inside]) <= nearest_distance(ends, complement)).all())
+
+
+def test_outside_the_set_nothing_has_a_clearance():
+    found = robust_invariant_set(unstable(LINE), LINE, RIM)
+    assert float(found.clearance[~found.inside].abs().max()) == 0.0
 
 
 # --- the integrator: z+ = z + u, every point can be held -------------------------------------------------------------
 
+DRIFT = LINE[:, None] + torch.tensor([0.1, 0.2])[None, :, None]
 
-def test_integrator_holds_everything_that_the_radius_allows():
+
+def test_integrator_holds_everything():
     step = LINE[:, None] + torch.tensor([-0.1, 0.0, 0.1])[None, :, None]
-    assert bool(robust_invariant_set(step, LINE, RIM, radius=0.05).inside.all())
+    assert bool(robust_invariant_set(step, LINE, RIM).inside.all())
 
 
 def test_integrator_that_cannot_stop_holds_nothing():
-    drift = LINE[:, None] + torch.tensor([0.1, 0.2])[None, :, None]
-    found = robust_invariant_set(drift, LINE, RIM, radius=SMALL)
+    found = robust_invariant_set(DRIFT, LINE, RIM)
     assert not bool(found.inside.any())
     assert found.iterations > 3
+
+
+def test_what_ends_safely_is_never_removed_and_saves_what_leads_there():
+    absorbing = LINE[:, 0].abs() < 0.101
+    found = robust_invariant_set(DRIFT, LINE, RIM, absorbing=absorbing)
+    assert bool(found.inside[absorbing].all())
+    assert bool(found.inside[LINE[:, 0].sub(-0.7).abs() < 0.2].all())  # they drift into it
+    assert not bool(found.inside[LINE[:, 0] > 0.11].any())  # they have passed it
 
 
 def test_bad_shapes_and_missing_labels_are_errors():
     step = unstable(LINE)
     with pytest.raises(EmptyRegionError, match="unsafe latent"):
-        robust_invariant_set(step, LINE, RIM[:0], radius=0.0)
+        robust_invariant_set(step, LINE, RIM[:0])
     with pytest.raises(ShapeError, match="one row per candidate"):
-        robust_invariant_set(step, LINE[:-1], RIM, radius=0.0)
+        robust_invariant_set(step, LINE[:-1], RIM)
     with pytest.raises(ShapeError, match="residuals"):
-        robust_invariant_set(step, LINE, RIM, radius=0.0, residuals=torch.zeros(3, 1, 1))
+        robust_invariant_set(step, LINE, RIM, residuals=torch.zeros(3, 1, 1))
 
 
 # --- residuals --------------------------------------------------------------------------------------------------------

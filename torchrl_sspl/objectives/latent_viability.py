@@ -1,11 +1,10 @@
 r"""Robust invariant sets of a cloud of latents: what the barrier and the policy are taught.
 
 With frozen encoder and dynamics the encoded data is a point cloud :math:`\{z_i\}`. The largest subset
-:math:`K` such that every :math:`z_i \in K` has an action :math:`u` whose predicted successor keeps a
-distance larger than a radius :math:`\rho` from every point outside :math:`K` is a viability kernel of the
-learned model that tolerates latent errors up to :math:`\rho`. A barrier equal to :math:`L_B` times the
-signed distance to :math:`K` then satisfies :math:`B(z) \le 0 \Rightarrow B(d(z, u)) \le -L_B \rho`: the
-signed distance is the deepest :math:`L_B`-Lipschitz function with that zero level. Only the labels "unsafe"
+:math:`K` such that every :math:`z_i \in K` has an action :math:`u` whose predicted successor stays in :math:`K`,
+whichever of the errors observed nearby is added, is a viability kernel of the learned model that tolerates these
+errors. The barrier is taught :math:`L_B` times the signed distance to :math:`K`, the deepest
+:math:`L_B`-Lipschitz function with that zero level. Only the labels "unsafe"
 enter; no state is used.
 """
 
@@ -90,8 +89,8 @@ class InvariantSet:
 
     Attributes:
         inside: ``(n,)`` bool, which candidates belong to the set.
-        clearance: ``(n, k)`` distance from the successor under each action to the nearest point outside;
-            for points outside, as it was when they were removed.
+        clearance: ``(n, k)`` distance from the successor under each action, the worst of its errors, to the nearest
+            point outside; zero for candidates outside and for actions that leave the set.
         iterations: sweeps until nothing more was removed.
     """
 
@@ -105,24 +104,25 @@ def robust_invariant_set(
     candidates: Tensor,
     outside: Tensor,
     *,
-    radius: float,
     residuals: Tensor | None = None,
-    max_iterations: int = 500,
+    absorbing: Tensor | None = None,
+    max_iterations: int = 1000,
 ) -> InvariantSet:
     r"""Largest subset of the candidates that can be kept, whatever the latent error among the given ones.
 
-    .. math:: K_{j+1} = \{ z_i \in K_j : \max_u \min_e \operatorname{dist}(d(z_i, u) + e, \text{outside} \cup K_j^c) > \rho \}
+    .. math:: K_{j+1} = \{ z_i \in K_j : \exists u \; \forall e: \operatorname{nn}(d(z_i, u) + e) \in K_j \}
 
-    The error e runs over the residuals that were observed near :math:`z_i`: the error of a model from pixels is far
-    from round (a velocity is seen less well than a position), and a ball as large as its longest axis would cost
-    most of the set.
+    with nn the nearest of all candidates and outside points: the cloud is its own grid. The error e runs over the
+    residuals that were observed near :math:`z_i`: the error of a model from pixels is far from round (a velocity is
+    seen less well than a position), and a ball as large as its longest axis would cost most of the set.
 
     Args:
         successors: ``(n, k, p)`` predicted successors of every candidate under every action.
         candidates: ``(n, p)`` latents that carry no "unsafe" label.
         outside: ``(m, p)`` latents of the unsafe label.
-        radius: latent distance that remains to everything outside, in every direction.
         residuals: ``(n, j, p)`` observed errors of the dynamics near every candidate; none if not given.
+        absorbing: ``(n,)`` bool, candidates that belong to the set whatever follows (an episode that has ended
+            safely); none if not given.
         max_iterations: bound on the number of sweeps.
 
     Returns:
@@ -137,7 +137,7 @@ def robust_invariant_set(
     Example:
         >>> z = torch.linspace(-1, 1, 21)[:, None]
         >>> step = torch.stack([z - 0.2, z + 0.2], 1)
-        >>> found = robust_invariant_set(step, z, torch.tensor([[-1.1], [1.1]]), radius=0.05)
+        >>> found = robust_invariant_set(step, z, torch.tensor([[-1.1], [1.1]]))
         >>> int(found.inside.sum())
         21
     """
@@ -150,28 +150,29 @@ def robust_invariant_set(
         )
     if outside.shape[0] == 0:
         raise EmptyRegionError("expected at least one unsafe latent, received 0; label some observations unsafe")
-    queries = successors.detach().cpu().numpy()
     errors = np.zeros((n, 1, p), np.float32) if residuals is None else residuals.detach().cpu().numpy()
-    inside = np.ones(n, dtype=bool)
-    clearance = np.full((n, k), np.inf, dtype=np.float32)
-    removed = outside
+    ends = successors.detach().cpu().numpy()[:, :, None] + errors[:, None]  # (n, k, j, p)
+    nearest = _tree(torch.cat([candidates, outside])).query(ends)[1]
+    kept = np.zeros(n, dtype=bool) if absorbing is None else absorbing.detach().cpu().numpy().astype(bool)
+    member = np.zeros(n + len(outside), dtype=bool)
+    member[:n] = True
+    possible = np.ones((n, k), dtype=bool)
     iteration = 0
     for iteration in range(1, max_iterations + 1):
-        # Only the distance to what was removed last can lower a clearance: the tree stays small. An action that
-        # has failed once never comes back.
-        tree = _tree(removed)
-        row, action = np.nonzero((clearance > radius) & inside[:, None])
-        for j in range(errors.shape[1]):
-            distance = tree.query(queries[row, action] + errors[row, j])[0]
-            clearance[row, action] = np.minimum(clearance[row, action], distance)
-            alive = clearance[row, action] > radius
-            row, action = row[alive], action[alive]
-        lost = np.nonzero(inside & (clearance.max(1) <= radius))[0]
-        if not len(lost):
+        # An action that has failed once never comes back: the set only shrinks.
+        row, action = np.nonzero(possible & member[:n, None])
+        possible[row, action] = member[nearest[row, action]].all(1)
+        lost = member[:n] & ~possible.any(1) & ~kept
+        if not lost.any():
             break
-        inside[lost] = False
-        removed = candidates[torch.as_tensor(lost)]
-    return InvariantSet(torch.as_tensor(inside), torch.as_tensor(clearance), iteration)
+        member[:n][lost] = False
+    inside = torch.as_tensor(member[:n])
+    clearance = np.zeros((n, k), np.float32)
+    row, action = np.nonzero(possible & member[:n, None])
+    if len(row):
+        distance = _tree(torch.cat([candidates[~inside], outside])).query(ends[row, action])[0]
+        clearance[row, action] = distance.min(1)
+    return InvariantSet(inside, torch.as_tensor(clearance), iteration)
 
 
 def nearby_residuals(

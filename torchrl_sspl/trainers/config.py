@@ -103,7 +103,6 @@ class SynthesisConfig:
         exploration: standard deviation of the exploration, as a share of the largest action.
         dynamics_steps: optimiser steps of the refit of the latent dynamics.
         tube_radius: distance from the data up to which a latent off the manifold may belong to the safe set.
-        radius: latent distance rho that the invariant set of the data keeps to everything outside.
         residuals: observed errors of the dynamics per latent that the fine-tuning adds to successors.
         residual_spread: standard deviations of the local error that the invariant set of the data tolerates.
         actions: actions per dimension tried at every latent.
@@ -117,6 +116,7 @@ class SynthesisConfig:
         unsafe_margin: hinge margin on labelled unsafe latents.
         deviation_coeff: weight lambda_3 of the deviation from the user's policy (preset "paper").
         recovery_coeff: weight of the action that leads back, on latents outside the set.
+        guard: barrier value by which every held-out observation of U has to lie outside the set.
         check_episodes: held-out episodes of a round's check.
         check_horizon: steps of each.
     """
@@ -128,7 +128,6 @@ class SynthesisConfig:
     exploration: float = 0.15
     dynamics_steps: int = 6000
     tube_radius: float = 0.3
-    radius: float = 0.015
     residuals: int = 16
     residual_spread: float = 2.0
     actions: int = 21
@@ -142,7 +141,8 @@ class SynthesisConfig:
     unsafe_margin: float = 0.05
     deviation_coeff: float = 0.01
     recovery_coeff: float = 0.3
-    check_episodes: int = 1500
+    guard: float = 0.02
+    check_episodes: int = 4000
     check_horizon: int = 40
 
 
@@ -286,7 +286,6 @@ def _apply_preset(config: TrainingConfig) -> None:
             tune_steps=40,
             actions=5,
             batch=128,
-            radius=0.0,
             check_episodes=40,
             check_horizon=5,
         )

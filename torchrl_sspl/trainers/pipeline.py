@@ -44,6 +44,7 @@ from torchrl_sspl.trainers.evaluation import encode_states, rollout
 
 CHECKPOINT_FILE = "checkpoint.pt"
 _ENCODE_CHUNK = 1000
+_HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
 
 
 @dataclass
@@ -488,17 +489,14 @@ class SafePolicyTraining:
         s, seed = self.config.synthesis, self.config.seed + 500_000 + 1000 * number
         generator = torch.Generator().manual_seed(seed)
         agent = self._agent(0.0)
-        env, guard = self.env, 0.5 * s.margin
-        n = s.check_episodes
-        hardest = self._hardest_unsafe(agent, 4 * n, generator)
-        unsafe_states = torch.cat([env.unsafe_set.sample(4 * n, generator=generator), hardest])
+        env, n = self.env, s.check_episodes
+        hardest = self._hardest_unsafe(agent, 2 * n, generator)
+        unsafe_states = torch.cat([env.unsafe_set.sample(2 * n, generator=generator), hardest])
         unsafe = agent.barrier(encode_states(agent, env, unsafe_states))[:, 0]
         safe = agent.barrier(encode_states(agent, env, env.safe_set.sample(n, generator=generator)))[:, 0]
-        states = self._buffer_region().sample(6 * n, generator=generator)
+        states = self._buffer_region().sample(3 * n, generator=generator)
         value = agent.barrier(encode_states(agent, env, states))[:, 0]
-        # Half of the episodes start at the rim, where a set leaks first.
-        rim = states[(value.abs() < 0.08).nonzero()[:, 0]][: n // 2]
-        start = torch.cat([rim, states[value <= 0.08][: n - len(rim)]])
+        start = states[value <= _HIGHEST_LEVEL][:n]
         if not len(start):
             self._record(number, agent, Check(number, 0.0, 0, 0, 0, 0, 0.0, 0.0, False, "the set is empty"))
             return
@@ -508,10 +506,10 @@ class SafePolicyTraining:
         late = touches.flip(0).cumsum(0).flip(0) > 0
         back = rollout(agent, env, env.unsafe_set.sample(n // 4, generator=generator), 2 * s.check_horizon)
 
-        def check(level: float, guard: float) -> Check:
-            bad = int((unsafe <= level + guard).sum())
+        def check(level: float) -> Check:
+            bad = int((unsafe <= level + s.guard).sum())
             out = int((safe > level).sum())
-            left = int(((now <= level) & (after > level - guard)).any(0).sum())
+            left = int(((now <= level) & (after > level)).any(0).sum())
             touched = int(((episodes.barrier <= level) & late).any(0).sum())
             returned = float(((back.barrier[-1] <= level) & ~env.unsafe_set.contains(back.states[-1])).float().mean())
             size = float((value <= level).float().mean())
@@ -524,8 +522,8 @@ class SafePolicyTraining:
                 number, level, bad, out, left, touched, returned, size, not faults and size > 0, ", ".join(faults)
             )
 
-        levels = torch.linspace(-0.2, 0.08, 57).flip(0).tolist()
-        chosen = next((c for level in levels if (c := check(level, guard)).passed), check(0.0, guard))
+        levels = torch.linspace(-0.2, _HIGHEST_LEVEL, 57).flip(0).tolist()
+        chosen = next((c for level in levels if (c := check(level)).passed), check(0.0))
         self._record(number, agent, chosen)
 
     def _record(self, number: int, agent: Agent, check: Check) -> None:
@@ -575,11 +573,11 @@ class SafePolicyTraining:
         near, axes = nearby_residuals(
             zc, z[sample], residual[sample], count=s.residuals, spread=s.residual_spread
         )
-        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], radius=s.radius, residuals=axes)
+        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], residuals=axes)
         if not bool(found.inside.any()):
             raise ConfigError(
-                f"expected a robust invariant set of the data at synthesis.radius={s.radius}, found none in {len(zc)} "
-                "latents; lower synthesis.radius, or train the representation longer"
+                f"expected a robust invariant set of the data at synthesis.residual_spread={s.residual_spread}, found none "
+                f"in {len(zc)} latents; lower it, or train the representation longer"
             )
         inside = torch.zeros(len(z), dtype=torch.bool)
         inside[allowed.nonzero()[:, 0]] = found.inside
