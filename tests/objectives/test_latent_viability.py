@@ -103,6 +103,8 @@ def test_integrator_that_cannot_stop_holds_nothing():
     found = robust_invariant_set(DRIFT, LINE, RIM)
     assert not bool(found.inside.any())
     assert found.iterations > 3
+    assert int(found.removed.min()) == 1  # at the upper end
+    assert bool((found.removed.diff() <= 0).all())  # the lower end is kept longest
 
 
 def test_what_ends_safely_is_never_removed_and_saves_what_leads_there():

@@ -91,11 +91,13 @@ class InvariantSet:
         inside: ``(n,)`` bool, which candidates belong to the set.
         clearance: ``(n, k)`` distance from the successor under each action, the worst of its errors, to the nearest
             point outside; zero for candidates outside and for actions that leave the set.
+        removed: ``(n,)`` int64, sweep in which a candidate was removed; 0 for those inside.
         iterations: sweeps until nothing more was removed.
     """
 
     inside: Tensor
     clearance: Tensor
+    removed: Tensor
     iterations: int
 
 
@@ -157,6 +159,7 @@ def robust_invariant_set(
     member = np.zeros(n + len(outside), dtype=bool)
     member[:n] = True
     possible = np.ones((n, k), dtype=bool)
+    removed = np.zeros(n, dtype=np.int64)
     iteration = 0
     for iteration in range(1, max_iterations + 1):
         # An action that has failed once never comes back: the set only shrinks.
@@ -166,13 +169,14 @@ def robust_invariant_set(
         if not lost.any():
             break
         member[:n][lost] = False
+        removed[lost] = iteration
     inside = torch.as_tensor(member[:n])
     clearance = np.zeros((n, k), np.float32)
     row, action = np.nonzero(possible & member[:n, None])
     if len(row):
         distance = _tree(torch.cat([candidates[~inside], outside])).query(ends[row, action])[0]
         clearance[row, action] = distance.min(1)
-    return InvariantSet(inside, torch.as_tensor(clearance), iteration)
+    return InvariantSet(inside, torch.as_tensor(clearance), torch.as_tensor(removed), iteration)
 
 
 def nearby_residuals(

@@ -117,6 +117,7 @@ class SynthesisConfig:
         deviation_coeff: weight lambda_3 of the deviation from the user's policy (preset "paper").
         recovery_coeff: weight of the action that leads back, on latents outside the set.
         guard: barrier value by which every held-out observation of U has to lie outside the set.
+        leave_share: largest share of the held-out episodes that may leave the set; none may touch U.
         check_episodes: held-out episodes of a round's check.
         check_horizon: steps of each.
     """
@@ -129,12 +130,12 @@ class SynthesisConfig:
     dynamics_steps: int = 6000
     tube_radius: float = 0.3
     residuals: int = 16
-    residual_spread: float = 2.0
+    residual_spread: float = 1.5
     actions: int = 21
     fit_steps: int = 4000
     steer_steps: int = 1000
-    tune_steps: int = 2000
-    margin: float = 0.01
+    tune_steps: int = 5000
+    margin: float = 0.05
     band: float = 0.1
     batch: int = 1024
     lr: float = 1e-3
@@ -142,6 +143,7 @@ class SynthesisConfig:
     deviation_coeff: float = 0.01
     recovery_coeff: float = 0.3
     guard: float = 0.02
+    leave_share: float = 0.00075
     check_episodes: int = 4000
     check_horizon: int = 40
 
@@ -286,6 +288,7 @@ def _apply_preset(config: TrainingConfig) -> None:
             tune_steps=40,
             actions=5,
             batch=128,
+            residual_spread=0.0,
             check_episodes=40,
             check_horizon=5,
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -225,36 +224,3 @@ class EveryHook(TrainerHookBase):
         """Attaches the hook to ``post_steps_log``."""
         trainer.register_op("post_steps_log", self)
         trainer.register_module(name, self)
-
-
-def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
-    """Gives a matplotlib figure to a TorchRL logger, as far as that kind of logger can take one.
-
-    Args:
-        logger: a wandb, tensorboard or csv logger; the latter keeps a png file beside its scalars.
-        name: name of the figure.
-        figure: matplotlib figure.
-        step: collected frames.
-
-    Returns:
-        The file that was written, if any.
-
-    Source: none.
-
-    Example:
-        >>> log_figure(None, "latent", None, 0) is None
-        True
-    """
-    experiment: Any = getattr(logger, "experiment", None)
-    if hasattr(experiment, "add_figure"):  # tensorboard
-        experiment.add_figure(name, figure, global_step=step)
-    elif type(logger).__name__ == "WandbLogger":
-        import wandb
-
-        experiment.log({name: wandb.Image(figure)})
-    elif getattr(logger, "log_dir", None) is not None:
-        folder = Path(logger.log_dir) / logger.exp_name / "figures"
-        folder.mkdir(parents=True, exist_ok=True)
-        figure.savefig(folder / f"{name}_{step}.png")
-        return folder / f"{name}_{step}.png"
-    return None

@@ -502,22 +502,21 @@ class SafePolicyTraining:
             return
         episodes = rollout(agent, env, start, s.check_horizon)
         touches = env.unsafe_set.contains(episodes.states)
-        now, after = episodes.barrier[:-1], episodes.barrier[1:]
+        after = episodes.barrier[1:]
         late = touches.flip(0).cumsum(0).flip(0) > 0
         back = rollout(agent, env, env.unsafe_set.sample(n // 4, generator=generator), 2 * s.check_horizon)
 
         def check(level: float) -> Check:
             bad = int((unsafe <= level + s.guard).sum())
             out = int((safe > level).sum())
-            left = int(((now <= level) & (after > level)).any(0).sum())
+            inside = episodes.barrier[0] <= level
+            left = int((inside & (after > level).any(0)).sum())
             touched = int(((episodes.barrier <= level) & late).any(0).sum())
             returned = float(((back.barrier[-1] <= level) & ~env.unsafe_set.contains(back.states[-1])).float().mean())
             size = float((value <= level).float().mean())
-            faults = [
-                f"{k} {v}"
-                for k, v in (("unsafe inside", bad), ("safe outside", out), ("left", left), ("touched U", touched))
-                if v
-            ]
+            tolerated = s.leave_share * int(inside.sum())
+            counts = (("unsafe inside", bad, 0), ("safe outside", out, 0), ("left", left, tolerated), ("touched U", touched, 0))
+            faults = [f"{name} {found}" for name, found, most in counts if found > most]
             return Check(
                 number, level, bad, out, left, touched, returned, size, not faults and size > 0, ", ".join(faults)
             )
@@ -574,13 +573,13 @@ class SafePolicyTraining:
             zc, z[sample], residual[sample], count=s.residuals, spread=s.residual_spread
         )
         found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], residuals=axes)
-        if not bool(found.inside.any()):
-            raise ConfigError(
-                f"expected a robust invariant set of the data at synthesis.residual_spread={s.residual_spread}, found none "
-                f"in {len(zc)} latents; lower it, or train the representation longer"
-            )
+        kept = found.inside
+        if not bool(kept.any()):
+            # Nothing can be kept under these errors: go on with what can be kept longest, and let the held-out
+            # checks say what it is worth.
+            kept = found.removed == found.removed.max()
         inside = torch.zeros(len(z), dtype=torch.bool)
-        inside[allowed.nonzero()[:, 0]] = found.inside
+        inside[allowed.nonzero()[:, 0]] = kept
         stray = torch.rand(60000, z.shape[1], generator=g) * 2 - 1
         far = nearest_distance(stray, self._cloud(g)) > s.tube_radius
         tube, _ = self._tube(z, 2 * s.tube_radius, 1000 + number)
@@ -595,7 +594,7 @@ class SafePolicyTraining:
         )
         # Actions: inside, what keeps the largest clearance; outside, what leads back soonest.
         best = torch.zeros(len(z), self.env.action_dim)
-        keep = torch.softmax(found.clearance[found.inside] / 0.01, 1) @ actions
+        keep = torch.softmax(found.clearance[kept] / 0.01, 1) @ actions
         best[inside] = keep
         outer = (~inside).nonzero()[:, 0]
         times = reach_times(self._successors(z[outer], actions), z[outer], z[inside])

@@ -19,7 +19,8 @@ from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer,
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules import make_rollout_policy
 from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
-from torchrl_sspl.trainers.hooks import EveryHook, MarginHook, SeedHook, log_figure
+from torchrl_sspl.trainers.hooks import EveryHook, MarginHook, SeedHook
+from torchrl_sspl.trainers.loggers import log_figure
 from torchrl_sspl.trainers.stepper import SSPLStepper
 
 Call = Callable[["SSPLTrainer"], Mapping[str, Any]]
@@ -153,7 +154,10 @@ class SSPLTrainer(Trainer):
             target_net_updater=target_net_updater,
             **trainer_options,
         )
-        replay = ReplayBufferTrainer(replay_buffer, flatten_tensordicts=True)
+        device = loss_module.safety_margin.device
+        replay = ReplayBufferTrainer(
+            replay_buffer, flatten_tensordicts=True, device=None if device.type == "cpu" else device
+        )
         self.register_op("batch_process", replay.extend)
         self.register_op("process_optim_batch", replay.sample)
         self.register_module("replay_buffer", replay)
