@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import copy
+import functools
 import multiprocessing
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,13 +12,14 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torchrl.collectors import Collector
+from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 
 from torchrl_sspl.data.store import TransitionStore
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.sets import Region
 
+BACKENDS = ("sync", "process", "ray")
 _BATCH = 2048  # transitions at a time; an episode that a batch cuts in two costs two frames more
 
 
@@ -180,6 +183,100 @@ def collect_rollouts(
     return store
 
 
+def make_collector(
+    make_env: Callable[..., EnvBase],
+    policy: TensorDictModuleBase,
+    *,
+    backend: str = "sync",
+    workers: int = 1,
+    frames_per_batch: int,
+    total_frames: int,
+    init_random_frames: int = 0,
+    policy_device: torch.device | str = "cpu",
+    ray_address: str = "",
+    seed: int | None = None,
+) -> BaseCollector:
+    """A TorchRL collector in this process, in others of this machine, or on a Ray cluster.
+
+    Batches have the same size and the same layout in all three. Environments live on the CPU; every batch begins with
+    resets, so that nothing depends on where a worker had stopped. With ``"process"`` and ``"ray"`` the workers hold copies
+    of the policy, which ``update_policy_weights_`` renews (``SSPLTrainer`` does so after every batch).
+
+    Args:
+        make_env: ``(seed=...) -> environment``; it has to be picklable for other processes.
+        policy: writes ``"action"``.
+        backend: ``"sync"``, ``"process"`` or ``"ray"``.
+        workers: number of collectors, 1 for ``"sync"``.
+        frames_per_batch: transitions per batch, over all workers.
+        total_frames: transitions to collect in all.
+        init_random_frames: transitions under random actions at the beginning.
+        policy_device: device of the policy; other processes always use the CPU.
+        ray_address: address of a running cluster; ``""`` starts Ray on this machine.
+        seed: seed of the environments; workers get different ones.
+
+    Returns:
+        The collector.
+
+    Raises:
+        ConfigError: if the backend is unknown, or the numbers do not go together.
+        MissingDependencyError: if Ray is asked for and not installed.
+
+    Source: none.
+
+    Example:
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> make = functools.partial(PendulumEnv, batch_size=[4], image_size=16)
+        >>> collector = make_collector(make, RandomActions(make()), frames_per_batch=16, total_frames=32, seed=0)
+        >>> [batch.numel() for batch in collector]
+        [16, 16]
+    """
+    if backend not in BACKENDS:
+        raise ConfigError(f"collector.backend: expected one of {', '.join(BACKENDS)}, received {backend!r}.")
+    if workers < 1 or (backend == "sync" and workers != 1):
+        raise ConfigError(f"collector.workers: expected 1 with backend 'sync', else at least 1, received {workers}.")
+    if frames_per_batch % workers:
+        raise ConfigError(
+            f"collector.frames_per_batch: expected a multiple of the {workers} workers, received {frames_per_batch}."
+        )
+    options: dict[str, Any] = {
+        "frames_per_batch": frames_per_batch,
+        "total_frames": total_frames,
+        "init_random_frames": init_random_frames,
+        "reset_at_each_iter": True,
+        "trust_policy": True,
+    }
+    base = 0 if seed is None else seed
+    makers = [functools.partial(make_env, seed=base + 7919 * k) for k in range(workers)]
+    if backend == "sync":
+        return Collector(
+            makers[0](), policy, policy_device=policy_device, env_device="cpu", storing_device="cpu",
+            auto_register_policy_transforms=False, **options,
+        )  # fmt: skip
+    copied = copy.deepcopy(policy).cpu()
+    if backend == "process":
+        return Collector(
+            makers, copied, backend="process", sync=True, cat_results="stack", auto_register_policy_transforms=False,
+            **options,
+        )  # fmt: skip
+    return _ray_collector(makers, copied, ray_address, options)
+
+
+def _ray_collector(makers: list[Any], policy: TensorDictModuleBase, address: str, options: dict[str, Any]) -> BaseCollector:
+    try:
+        import ray  # noqa: F401
+    except ImportError as error:
+        raise MissingDependencyError(
+            "collector.backend=ray: expected Ray, found none; run `pip install 'torchrl-sspl[ray]'`."
+        ) from error
+    cluster: dict[str, Any] = {"address": address} if address else {"num_cpus": len(makers), "include_dashboard": False}
+    return Collector(
+        makers, policy, backend="ray", sync=True,
+        ray_init_config={**cluster, "log_to_driver": False, "ignore_reinit_error": True},
+        remote_configs={"num_cpus": 1, "num_gpus": 0, "memory": 2 * 1024**3},
+        **options,
+    )  # fmt: skip
+
+
 @contextlib.contextmanager
 def _starting_in(env: Any, region: Region | None) -> Iterator[None]:
     """Let episodes of the environment start in a region meanwhile."""
@@ -193,4 +290,4 @@ def _starting_in(env: Any, region: Region | None) -> Iterator[None]:
         env.initial_set = before
 
 
-__all__ = ["RandomActions", "collect_random", "collect_rollouts"]
+__all__ = ["BACKENDS", "RandomActions", "collect_random", "collect_rollouts", "make_collector"]

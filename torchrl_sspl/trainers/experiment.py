@@ -1,0 +1,394 @@
+"""One experiment on TorchRL's trainer: any environment with pixels and labels, from configuration to report."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.objectives import SoftUpdate
+from tqdm import tqdm
+
+from torchrl_sspl.data import TransitionStore
+from torchrl_sspl.data.collect import make_collector
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import ConfigError, EmptyRegionError, MissingDependencyError
+from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
+from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, make_rollout_policy
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.objectives import SSPLLoss
+from torchrl_sspl.trainers.episodes import evaluate_episodes, logged, random_actions, run_episodes, separating_level
+from torchrl_sspl.trainers.evaluation import Evaluation
+from torchrl_sspl.trainers.experiment_config import EnvFactory, ExperimentConfig, resolve
+from torchrl_sspl.trainers.loggers import close_logger, log_figure, log_scalars, log_video, make_logger
+from torchrl_sspl.trainers.torchrl_trainer import SSPLTrainer
+
+MakeEnv = Callable[..., EnvBase]
+SUMMARY = (
+    ("unsafe_called_safe", "episodes with an observation of U at B <= 0"),
+    ("safe_called_unsafe", "episodes with an observation of S at B > 0"),
+    ("starts_inside", "resets with B <= 0"),
+    ("touch_unsafe", "episodes from B <= 0 that touch U, under the policy"),
+    ("leave", "episodes from B <= 0 that leave it, under the policy"),
+    ("random_touch_unsafe", "episodes that touch U, under random actions"),
+)
+
+
+class ExploringPolicy(TensorDictModuleBase):
+    """Rollout policy that explores: noise on its actions, and now and then a random action instead.
+
+    Args:
+        policy: pixels -> ``"action"``.
+        low, high: bounds of the action ``(action_dim,)``.
+        exploration: standard deviation of the noise, as a share of the half range.
+        random_share: share of steps with a uniformly random action.
+
+    Source: none.
+    """
+
+    low: torch.Tensor
+    high: torch.Tensor
+
+    def __init__(
+        self, policy: nn.Module, low: torch.Tensor, high: torch.Tensor, exploration: float, random_share: float
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = ["pixels"], ["action"]
+        self.policy, self.exploration, self.random_share = policy, exploration, random_share
+        self.register_buffer("low", low.clone())
+        self.register_buffer("high", high.clone())
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"`` ``(*batch, action_dim)``."""
+        action = self.policy(tensordict.select("pixels"))["action"]
+        half = (self.high - self.low) / 2
+        noisy = action + self.exploration * half * torch.randn_like(action)
+        uniform = self.low + (self.high - self.low) * torch.rand_like(action)
+        swap = torch.rand_like(action[..., :1]) < self.random_share
+        return tensordict.set("action", torch.where(swap, uniform, noisy.clamp(self.low, self.high)))
+
+
+class TrainingStarts:
+    """Environments for training: where the sets are known, half of the episodes start in S.
+
+    Args:
+        make_env: ``(batch_size=[n], seed=...) -> environment``.
+        batch_size: ``[n]``.
+
+    Source: none.
+    """
+
+    def __init__(self, make_env: MakeEnv, batch_size: list[int]) -> None:
+        self.make_env, self.batch_size = make_env, batch_size
+
+    def __call__(self, seed: int | None = None) -> EnvBase:
+        """An environment; others than those of this library start as they always do."""
+        env = self.make_env(batch_size=self.batch_size, seed=seed)
+        if isinstance(env, SafetyEnv):
+            env.initial_set = env.safe_set | env.initial_set
+        return env
+
+
+@dataclass
+class ExperimentOutcome:
+    """What an experiment produced.
+
+    Attributes:
+        directory: where everything lies.
+        agent: the frozen agent.
+        evaluation: measurements on fresh episodes.
+        seconds: wall-clock time of the training.
+        report: the page, or None where matplotlib is missing.
+    """
+
+    directory: Path
+    agent: Agent
+    evaluation: Evaluation
+    seconds: float
+    report: Path | None
+
+    def summary(self) -> str:
+        """The main measurements as text."""
+        lines = []
+        for name, label in SUMMARY:
+            m = self.evaluation.measurements[name]
+            value = "not measured" if m.value is None else f"{m.value:.2%} ({m.events} of {m.n})"
+            bounds = "" if m.lower is None or m.upper is None else f", 95 % bounds {m.lower:.2%} to {m.upper:.2%}"
+            lines.append(f"{label:<52} {value}{bounds}")
+        proof = self.agent.description["lipschitz"]
+        proved = "proved" if proof["proved"] else f"not proved ({proof['reason']})"
+        lines.append(f"the barrier is {self.agent.lipschitz_bound:g}-Lipschitz: {proved}")
+        return "\n".join([*lines, f"training: {self.seconds:.0f} s"])
+
+
+class Experiment:
+    """Environment, networks, loss, collector, store, trainer and logger of a configuration.
+
+    Args:
+        config: everything that determines the run.
+        make_env: ``(batch_size=[n], seed=...) -> environment`` with keys ``"pixels"`` and ``"region"``; by default
+            what ``config.env`` describes.
+        encoder: ``(latent_dim) -> module`` from pixels ``(*batch, 6, H, W)`` uint8 to latents in [-1, 1]; by default
+            what ``config.network`` describes.
+        title: title of the report.
+
+    Raises:
+        ConfigError: if values of the configuration do not go together, or the environment lacks labels.
+
+    Source: paper, Algorithm 1, on TorchRL's trainer.
+    """
+
+    def __init__(
+        self,
+        config: ExperimentConfig,
+        make_env: MakeEnv | None = None,
+        *,
+        encoder: Callable[[int], nn.Module] | None = None,
+        title: str = "Safe policy from pixels",
+    ) -> None:
+        self.config, self.title = config.check(), title
+        self.make_env = EnvFactory(config.env) if make_env is None else make_env
+        self.directory = Path(config.out_dir)
+        self.directory.mkdir(parents=True, exist_ok=True)
+        self.device = torch.device(config.device)
+        env = self.make_env(batch_size=[1], seed=config.seed)
+        missing = {"pixels", "region"} - set(env.observation_spec.keys())
+        if missing:
+            raise ConfigError(f"expected an environment with the keys pixels and region, found no {sorted(missing)}")
+        space = env.action_spec_unbatched.space
+        self._low, self._high = space.low.cpu().float(), space.high.cpu().float()
+        env.close()
+        torch.manual_seed(config.seed)
+        self._make_networks(encoder)
+        self.logger = make_logger(
+            config.logger.kind, config.logger.kind, self.directory, **_project(config.logger)
+        )
+        self.trainer = self._make_trainer()
+        self.seconds = 0.0
+
+    def _make_networks(self, encoder: Callable[[int], nn.Module] | None) -> None:
+        net, scale = self.config.network, (self._high - self._low) / 2
+        dim = len(scale)
+        if encoder is None and net.encoder:
+            encoder = resolve(net.encoder)
+        if encoder is None:
+            arguments: dict[str, Any] = {
+                "latent_dim": net.latent_dim, "pool_to": net.pool_to, "velocity_gain": net.velocity_gain
+            }  # fmt: skip
+            self.encoder: nn.Module = FrameEncoder(**arguments)
+            name = "FrameEncoder"
+        else:
+            arguments = {"latent_dim": net.latent_dim}
+            self.encoder = encoder(net.latent_dim)
+            name = getattr(encoder, "__name__", type(self.encoder).__name__)
+        sizes = {"latent_dim": net.latent_dim, "action_dim": dim, "action_scale": scale.tolist()}
+        self.dynamics = LatentDynamics(hidden=net.dynamics_hidden, **sizes)
+        self.policy = Policy(hidden=net.policy_hidden, **sizes)
+        self.barrier = SandwichBarrier(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
+        for module in (self.encoder, self.dynamics, self.policy, self.barrier):
+            module.to(self.device)
+        self.description: dict[str, Any] = {
+            "networks": {
+                "encoder": {"class": name, "arguments": arguments},
+                "dynamics": {"class": "LatentDynamics", "arguments": {**sizes, "hidden": list(net.dynamics_hidden)}},
+                "policy": {"class": "Policy", "arguments": {**sizes, "hidden": list(net.policy_hidden)}},
+                "barrier": {"latent_dim": net.latent_dim, "hidden": list(net.barrier_hidden)},
+            },
+            "experiment": self.config.to_dict(),
+        }
+
+    def _make_trainer(self) -> SSPLTrainer:
+        config, t, c = self.config, self.config.trainer, self.config.collector
+        options = {k: v for k, v in vars(config.loss).items() if v is not None}
+        self.loss = SSPLLoss(self.encoder, self.dynamics, self.barrier, self.policy, **options).to(self.device)
+        if t.compile:
+            self.loss.compile()
+        rollout_policy = ExploringPolicy(
+            make_rollout_policy(self.loss.encoder, self.loss.actor_network),
+            self._low, self._high, c.exploration, c.random_share,
+        ).to(self.device)  # fmt: skip
+        collector = make_collector(
+            TrainingStarts(self.make_env, [c.envs]),
+            rollout_policy,
+            backend=c.backend,
+            workers=c.workers,
+            frames_per_batch=c.frames_per_batch,
+            total_frames=t.total_frames,
+            init_random_frames=c.init_random_frames,
+            policy_device=self.device,
+            ray_address=c.ray_address,
+            seed=config.seed,
+        )
+        # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
+        store = TransitionStore(config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"))
+        buffer = store.replay_buffer(config.buffer.batch, safe=config.buffer.safe, unsafe=config.buffer.unsafe)
+        delayed = any(name.startswith("target_") for name, _ in self.loss.named_children())
+        optimizer = torch.optim.Adam(self.loss.parameters(), config.optim.lr, weight_decay=config.optim.weight_decay)
+        return SSPLTrainer(
+            collector=collector,
+            total_frames=t.total_frames,
+            loss_module=self.loss,
+            optimizer=optimizer,
+            replay_buffer=buffer,
+            optim_steps_per_batch=t.optim_steps_per_batch,
+            warm_start_steps=t.warm_start_steps,
+            target_net_updater=SoftUpdate(self.loss, tau=config.optim.target_tau) if delayed else None,
+            rollout_policy=rollout_policy,
+            evaluate=self._evaluate_during if t.evaluate_every else None,
+            evaluate_every=max(1, t.evaluate_every),
+            checkpoint_dir=self.directory / "checkpoints" if t.checkpoint_every >= 0 else None,
+            checkpoint_every=max(0, t.checkpoint_every),
+            keep_checkpoints=t.keep_checkpoints,
+            autocast=None if t.autocast == "none" else getattr(torch, t.autocast),
+            clip_norm=t.clip_norm,
+            logger=self.logger,
+            log_interval=0,
+            progress_bar=t.progress,
+        )
+
+    def _evaluate_during(self, trainer: SSPLTrainer) -> dict[str, Any]:
+        return logged(evaluate_episodes(self.agent(), self.make_env, self.config.evaluation))
+
+    def agent(self, level: float = 0.0) -> Agent:
+        """A frozen copy of the present networks, the barrier collapsed to a plain network and shifted.
+
+        Args:
+            level: {B <= level} becomes {B <= 0}.
+
+        Returns:
+            The agent, with the proof of its Lipschitz bound in its description.
+
+        Source: none.
+        """
+        import copy
+
+        parts = [copy.deepcopy(m).cpu() for m in (self.encoder, self.dynamics, self.barrier, self.policy)]
+        barrier = parts[2].collapse()  # type: ignore[operator]
+        with torch.no_grad():
+            barrier[-1].bias.sub_(level)
+        witness = [m.tolist() for m in parts[2].multipliers()]  # type: ignore[operator]
+        bound = self.config.network.lipschitz_bound
+        agent = Agent(parts[0], parts[1], barrier, parts[3], bound, self.description)
+        proof = prove_lipschitz(agent.barrier, bound, multipliers=[torch.tensor(m) for m in witness])
+        agent.description["lipschitz"] = {"proved": proof.proved, "reason": proof.reason, "multipliers": witness}
+        return agent
+
+    def train(self, *, resume: bool = True) -> Agent:
+        """Train, or go on from the last checkpoint.
+
+        Args:
+            resume: continue from a checkpoint in the directory, if there is one.
+
+        Returns:
+            The agent, its zero level placed on held-out episodes.
+
+        Source: paper, Algorithm 1.
+        """
+        began = time.monotonic()
+        if resume and self.trainer.checkpoint_rotation is not None:
+            self.trainer.resume()
+        if self.trainer.collected_frames < self.config.trainer.total_frames:
+            try:
+                self.trainer.train()
+            except EmptyRegionError as error:
+                raise EmptyRegionError(
+                    f"{error} Before the first optimiser step both sets have to be seen: raise "
+                    "collector.init_random_frames, start episodes there (reset_options of the environment), or lower "
+                    "buffer.safe or buffer.unsafe to 0."
+                ) from error
+        else:
+            self.trainer.collector.shutdown()
+        agent = self.agent(self._level())
+        agent.save(self.directory / "agent")
+        self.seconds = time.monotonic() - began
+        return agent
+
+    def _level(self) -> float:
+        e = self.config.evaluation
+        if not e.calibrate:
+            return 0.0
+        seed = e.seed + 1000
+        env = self.make_env(batch_size=[e.envs], seed=seed)
+        try:
+            agent = self.agent()
+            held_out = [
+                run_episodes(agent, env, e.episodes, e.horizon),
+                run_episodes(agent, env, e.episodes, e.horizon, random_actions(env, seed + 1)),
+            ]
+        finally:
+            env.close()
+        return separating_level(held_out, e.guard)
+
+    def run(self, *, resume: bool = True) -> ExperimentOutcome:
+        """Train, evaluate on fresh episodes, and report; everything lands in ``config.out_dir``.
+
+        Args:
+            resume: continue from a checkpoint in the directory, if there is one.
+
+        Returns:
+            The outcome; ``metrics.json``, ``report.html`` and ``agent/`` are on disk.
+
+        Source: none.
+        """
+        (self.directory / "config.json").write_text(json.dumps(self.config.to_dict(), indent=1) + "\n")
+        agent = self.train(resume=resume)
+        evaluation = evaluate_episodes(agent, self.make_env, self.config.evaluation)
+        outcome = ExperimentOutcome(self.directory, agent, evaluation, self.seconds, None)
+        body = {"seed": self.config.seed, "training_seconds": self.seconds, "measurements": evaluation.to_dict(),
+                "lipschitz": {k: v for k, v in agent.description["lipschitz"].items() if k != "multipliers"},
+                "config": self.config.to_dict()}  # fmt: skip
+        (self.directory / "metrics.json").write_text(json.dumps(body, indent=1, sort_keys=True) + "\n")
+        frames = self.trainer.collected_frames
+        log_scalars(self.logger, logged(evaluation), frames)
+        try:
+            from torchrl_sspl.trainers.experiment_report import draw, write
+
+            figures = draw(self, outcome)
+            for name, figure in figures.items():
+                log_figure(self.logger, name.lower().replace(" ", "_"), figure, frames)
+            log_video(self.logger, "episode", evaluation.arrays["own"].film, frames)
+            outcome.report = write(self, outcome, figures)
+        except MissingDependencyError as error:
+            tqdm.write(f"no figures and no report: {error}")
+        close_logger(self.logger)
+        return outcome
+
+
+def run_experiment(
+    make_env: MakeEnv, overrides: Any = (), *, encoder: Callable[[int], nn.Module] | None = None,
+    title: str = "Safe policy from pixels", **defaults: Any,
+) -> ExperimentOutcome:  # fmt: skip
+    """Train, evaluate and report for an environment of your own, in one call.
+
+    Args:
+        make_env: ``(batch_size=[n], seed=...) -> environment`` with keys ``"pixels"`` and ``"region"``, such as
+            ``partial(GymnasiumPixels, make, safe=..., unsafe=...)``.
+        overrides: ``key=value`` strings for the configuration.
+        encoder: ``(latent_dim) -> module`` from pixels to latents; by default ``FrameEncoder``.
+        title: title of the report.
+        **defaults: values in place of the defaults (nested keys with a dot need ``**{"a.b": v}``).
+
+    Returns:
+        The outcome: agent, evaluation, report.
+
+    Raises:
+        ConfigError: if a key or a value is not valid.
+
+    Source: paper, Algorithm 1.
+    """
+    from torchrl_sspl.trainers.experiment_config import experiment_config
+
+    return Experiment(experiment_config(overrides, **defaults), make_env, encoder=encoder, title=title).run()
+
+
+def _project(logger: Any) -> dict[str, str]:
+    return {"project": logger.project} if hasattr(logger, "project") else {}

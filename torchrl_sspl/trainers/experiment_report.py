@@ -1,0 +1,109 @@
+"""Figures and page of an experiment on an environment without a known model."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+
+from torchrl_sspl.sets import UNSAFE
+from torchrl_sspl.trainers.loggers import encode_gif
+
+if TYPE_CHECKING:
+    from torchrl_sspl.trainers.experiment import Experiment, ExperimentOutcome
+
+_SHOWN = 40
+
+
+def draw(experiment: Experiment, outcome: ExperimentOutcome) -> dict[str, Any]:
+    """Figures of an experiment: latent space, barrier along episodes, losses.
+
+    Args:
+        experiment: gives the log of the training.
+        outcome: gives agent and evaluation.
+
+    Returns:
+        Matplotlib figures by title.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: none.
+    """
+    from torchrl_sspl.viz.figures import latent_space
+    from torchrl_sspl.viz.plane import new_figure
+
+    own, chance = outcome.evaluation.arrays["own"], outcome.evaluation.arrays["chance"]
+    alive = torch.cat([own.alive, chance.alive], 1)
+    latent = torch.cat([own.latent, chance.latent], 1)[alive]
+    region = torch.cat([own.region, chance.region], 1)[alive]
+    figures: dict[str, Any] = {}
+    if latent.shape[1] >= 2:
+        figures["Latent space"] = latent_space(latent, region, outcome.agent.barrier)
+    figure = new_figure(8, 3.6, "Barrier value along fresh episodes; a dot marks an observation of U.")
+    for k, (name, episodes) in enumerate((("under the policy", own), ("under random actions", chance))):
+        axes = figure.add_subplot(1, 2, k + 1)
+        value = torch.where(episodes.alive, episodes.barrier, float("nan"))[:, :_SHOWN]
+        axes.plot(value, color="C0", linewidth=0.7, alpha=0.5)
+        step, episode = ((episodes.region == UNSAFE) & episodes.alive)[:, :_SHOWN].nonzero(as_tuple=True)
+        axes.plot(step, value[step, episode], ".", color="C3", markersize=3)
+        axes.axhline(0, color="black", linewidth=1)
+        axes.set(title=name, xlabel="step", ylabel="B")
+    figures["Barrier along episodes"] = figure
+    history = {k: v for k, v in experiment.trainer._log_dict.items() if k.startswith("loss_") and len(v)}
+    if history:
+        figure = new_figure(8, 4, "Terms of the loss, one value per collected batch.")
+        axes = figure.add_subplot()
+        for name, values in sorted(history.items()):
+            axes.plot([max(float(v), 1e-6) for v in values], label=name.removeprefix("loss_"), linewidth=1)
+        axes.set(xlabel="batch", ylabel="loss", yscale="log")
+        axes.legend(fontsize=7, ncols=2, frameon=False)
+        figures["Training"] = figure
+    return figures
+
+
+def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str, Any]) -> Path:
+    """Write ``report.html`` of an experiment.
+
+    Args:
+        experiment: gives title and configuration.
+        outcome: gives agent and evaluation.
+        figures: what :func:`draw` has returned.
+
+    Returns:
+        The page.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: none.
+    """
+    from torchrl_sspl.viz.report import write_report
+
+    film = outcome.directory / "episode.gif"
+    film.write_bytes(encode_gif(outcome.evaluation.arrays["own"].film))
+    proof = outcome.agent.description["lipschitz"]
+    bound = f"The deployed float32 barrier is {outcome.agent.lipschitz_bound:g}-Lipschitz on all of its domain"
+    notes = [
+        f"Training took {outcome.seconds:.0f} s.",
+        "No model of the environment is known: every figure counts fresh episodes from its own resets. Nothing is said "
+        "about states that these do not reach.",
+    ]
+    if not proof["proved"]:
+        notes.append(f"Not proved: {bound[0].lower() + bound[1:]}; {proof['reason']}.")
+    config = experiment.config.to_dict()
+    return write_report(
+        outcome.directory / "report.html",
+        title=experiment.title,
+        measurements=outcome.evaluation.measurements,
+        figures=figures,
+        config={k: v for k, v in config.items() if v not in (None, {})},
+        video=film,
+        notes="\n\n".join(notes),
+        proved=[f"{bound} (exact integer arithmetic)."] if proof["proved"] else [],
+        assumed=[
+            "The environment, its pictures and its resets stay as they were during the evaluation.",
+            "Episodes are independent; observations within one are not, and carry no bound.",
+        ],
+    )

@@ -1,0 +1,345 @@
+"""Loggers of a run: which there are, what they are given, and the names of all metrics."""
+
+from __future__ import annotations
+
+import io
+import os
+import socket
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from torch import Tensor
+
+from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, ShapeError
+
+LOGGERS = ("csv", "wandb", "tensorboard", "none")
+
+#: Every metric that training and evaluation log, and what it is. The set does not grow during a run.
+METRICS: Mapping[str, str] = MappingProxyType(
+    {
+        # Terms of the losses, weighted as they are summed.
+        "loss_safe": "hinge on labelled safe observations: B above -margin",
+        "loss_unsafe": "hinge on labelled unsafe observations: B below margin",
+        "loss_consistency": "squared distance of the predicted from the observed next latent",
+        "loss_inverse_dynamics": "error of the action read from two successive latents",
+        "loss_variance": "hinge on the standard deviation of every latent coordinate",
+        "loss_covariance": "squared covariances of latent coordinates",
+        "loss_saturation": "encoder outputs deep in the tanh",
+        "loss_synthesis": "violation of the invariance condition on observed latents",
+        "loss_off_manifold": "the same on latents drawn uniformly from the cube",
+        "loss_growth": "barrier values of latents whose successor is inside by the margin",
+        "loss_descent": "barrier value of the successor, as the policy alone can lower it",
+        "loss_policy_deviation": "distance of the policy's from the user's action",
+        "loss_lipschitz": "-log det of the matrix that certifies the Lipschitz bound",
+        "loss_target": "distance of the barrier from its targets",
+        "loss_policy_target": "distance of the policy from its targets",
+        # What the losses measure on their batches.
+        "dynamics_error": "mean distance of predicted from observed next latent, on the batch",
+        "dynamics_error_max": "largest of these distances",
+        "safe_error": "share of labelled safe rows with B > 0, on the batch",
+        "unsafe_error": "share of labelled unsafe rows with B <= 0, on the batch",
+        "latent_std": "smallest standard deviation of a latent coordinate",
+        "violation_max": "largest violation of the condition, on the batch",
+        "violation_share": "share of rows that violate the condition",
+        "inside_share": "share of rows with B <= 0",
+        "eigenvalue_min": "smallest eigenvalue of the matrix that certifies the Lipschitz bound",
+        # The optimisation.
+        "grad_norm": "norm of the gradient before clipping",
+        "warm_start": "1 while the world model alone is trained",
+        "optim_steps": "optimiser steps so far",
+        "lipschitz_share": "share of the last Lipschitz step that was kept",
+        # Margins, estimated from the buffer.
+        "covering_radius": "radius within which one half of a sample covers the other (latent units)",
+        "dynamics_error_sample": "chosen quantile of the latent prediction error on the sample",
+        "safety_margin": "margin psi in force",
+        "dynamics_margin": "margin eta in force",
+        # Rounds of the two-time-scale training.
+        "inside_of_allowed": "share of encoded data inside the robust invariant set",
+        "sweeps": "sweeps until that set stood still",
+        "level": "shift of the barrier with which a round's checks passed",
+        "unsafe_inside": "held-out observations of U with B <= 0 (a number)",
+        "safe_outside": "held-out observations of S with B > 0 (a number)",
+        "left": "held-out episodes that left {B <= 0} (a number)",
+        "touched": "held-out episodes that touched U (a number)",
+        "returned": "share of held-out episodes from U that ended inside",
+        "size": "share of held-out unlabelled observations with B <= 0",
+        "passed": "1 if the round passed its checks",
+        "steps_per_second": "optimiser steps per second since the last row",
+        # Evaluation of a frozen agent on fresh episodes of an environment without a known model.
+        "eval_unsafe_called_safe": "share of fresh episodes with an observation of U at B <= 0",
+        "eval_safe_called_unsafe": "share of fresh episodes with an observation of S at B > 0",
+        "eval_starts_inside": "share of fresh starts with B <= 0",
+        "eval_touch_unsafe": "share of episodes from B <= 0 under the policy that touch U",
+        "eval_leave": "share of episodes from B <= 0 under the policy that leave it",
+        "eval_random_touch_unsafe": "share of episodes under random actions that touch U",
+    }
+)
+
+
+def make_logger(
+    kind: str = "csv", name: str = "run", directory: str | Path = "runs", *, project: str = "torchrl-sspl"
+) -> Any:
+    """A TorchRL logger that works wherever it is started.
+
+    Args:
+        kind: ``"csv"`` (default), ``"wandb"``, ``"tensorboard"`` or ``"none"``. wandb writes to disk only, to be
+            uploaded with ``wandb sync``, where there is no key or its server cannot be reached; ``WANDB_MODE``, if
+            set, decides instead.
+        name: name of the run.
+        directory: folder in which the logger writes.
+        project: project of wandb.
+
+    Returns:
+        The logger, or ``None`` for ``"none"``.
+
+    Raises:
+        ConfigError: if the kind is unknown.
+        MissingDependencyError: if its package is not installed.
+
+    Source: none.
+
+    Example:
+        >>> make_logger("none") is None
+        True
+    """
+    if kind not in LOGGERS:
+        raise ConfigError(f"expected logger to be one of {', '.join(LOGGERS)}, received '{kind}'")
+    directory = Path(directory)
+    if kind == "none":
+        return None
+    if kind == "csv":
+        from torchrl.record.loggers.csv import CSVLogger
+
+        return CSVLogger(exp_name=name, log_dir=str(directory))
+    if kind == "tensorboard":
+        _need("tensorboard", "tensorboard")
+        from torchrl.record.loggers.tensorboard import TensorboardLogger
+
+        return TensorboardLogger(exp_name=name, log_dir=str(directory))
+    _need("wandb", "wandb")
+    from torchrl.record.loggers.wandb import WandbLogger
+
+    offline = wandb_offline()
+    with _unchanged("WANDB_MODE"):
+        directory.mkdir(parents=True, exist_ok=True)
+        return WandbLogger(
+            exp_name=name, offline=offline, log_dir=str(directory), project=project, log_env_packages=False
+        )
+
+
+def wandb_offline() -> bool:
+    """Whether a wandb run has to stay on disk: no key, or no way to its server.
+
+    Returns:
+        True if so; ``WANDB_MODE`` decides where it is set.
+
+    Source: none.
+    """
+    mode = os.environ.get("WANDB_MODE", "").lower()
+    if mode:
+        return mode in ("offline", "dryrun", "disabled")
+    if not (os.environ.get("WANDB_API_KEY") or _stored_key()):
+        return True
+    host = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0]
+    host, _, port = host.partition(":")
+    try:
+        socket.create_connection((host, int(port or 443)), timeout=3).close()
+    except (OSError, ValueError):
+        return True
+    return False
+
+
+def _stored_key() -> str | None:
+    """Key that ``wandb login`` has left in the netrc file."""
+    import netrc
+
+    path = Path(os.environ.get("NETRC", "~/.netrc")).expanduser()
+    if not path.is_file():
+        return None
+    host = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0].partition(":")[0]
+    try:
+        found = netrc.netrc(str(path)).authenticators(host)
+    except (OSError, netrc.NetrcParseError):
+        return None
+    return None if found is None else found[2]
+
+
+def log_scalars(logger: Any, values: Mapping[str, Any], step: int) -> None:
+    """Give a logger the metrics of a step, in one row where it has rows.
+
+    Args:
+        logger: TorchRL logger, or ``None``.
+        values: names, all of them in :data:`METRICS`, and numbers.
+        step: collected frames, or optimiser steps.
+
+    Raises:
+        ConfigError: if a name is not in :data:`METRICS`.
+
+    Source: none.
+
+    Example:
+        >>> log_scalars(None, {"grad_norm": 1.0}, step=0)
+    """
+    unknown = sorted(set(values) - set(METRICS))
+    if unknown:
+        raise ConfigError(f"expected names of METRICS, received {unknown}; add and document them first")
+    if logger is None:
+        return
+    for position, (name, value) in enumerate(values.items()):
+        options = {"commit": position == len(values) - 1} if type(logger).__name__ == "WandbLogger" else {}
+        logger.log_scalar(name, float(value), step=step, **options)
+
+
+def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
+    """Give a matplotlib figure to a TorchRL logger, as far as that kind of logger can take one.
+
+    Args:
+        logger: a wandb, tensorboard or csv logger; the latter keeps a png file beside its scalars.
+        name: name of the figure.
+        figure: matplotlib figure.
+        step: collected frames.
+
+    Returns:
+        The file that was written, if any.
+
+    Source: none.
+
+    Example:
+        >>> log_figure(None, "latent", None, 0) is None
+        True
+    """
+    experiment: Any = getattr(logger, "experiment", None)
+    if hasattr(experiment, "add_figure"):  # tensorboard
+        experiment.add_figure(name, figure, global_step=step, close=False)
+    elif type(logger).__name__ == "WandbLogger":
+        import wandb
+
+        experiment.log({name: wandb.Image(figure)})
+    elif getattr(logger, "log_dir", None) is not None:
+        path = _folder(logger, "figures") / f"{name}_{step}.png"
+        figure.savefig(path)
+        return path
+    return None
+
+
+def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 10) -> Path | None:
+    """Give a film to a TorchRL logger; none of them needs a package beyond Pillow for it.
+
+    Args:
+        logger: a wandb, tensorboard or csv logger; the latter keeps a gif file beside its scalars.
+        name: name of the film.
+        frames: ``(T, 3, H, W)`` uint8.
+        step: collected frames.
+        fps: frames per second.
+
+    Returns:
+        The file that was written, if any.
+
+    Raises:
+        ShapeError: if there is no frame, or the shape does not fit.
+        DTypeError: if the frames are not uint8.
+        MissingDependencyError: if Pillow is not installed.
+
+    Source: none.
+
+    Example:
+        >>> import torch
+        >>> log_video(None, "episode", torch.zeros(2, 3, 8, 8, dtype=torch.uint8), 0) is None
+        True
+    """
+    if str(frames.dtype) != "torch.uint8":
+        raise DTypeError(f"frames: expected torch.uint8, received {frames.dtype}; keep pictures unconverted.")
+    if frames.ndim != 4 or frames.shape[1] != 3 or not frames.shape[0]:
+        raise ShapeError(f"frames: expected shape (T, 3, H, W) with T >= 1, received {tuple(frames.shape)}.")
+    if logger is None:
+        return None
+    film = encode_gif(frames, fps)
+    experiment: Any = getattr(logger, "experiment", None)
+    if type(logger).__name__ == "WandbLogger":
+        import wandb
+
+        path = Path(experiment.dir) / f"{name}_{step}.gif"
+        path.write_bytes(film)
+        experiment.log({name: wandb.Video(str(path), format="gif")})
+        return path
+    if hasattr(experiment, "add_figure"):
+        from tensorboard.compat.proto.summary_pb2 import Summary
+
+        height, width = frames.shape[2:]
+        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=film)
+        experiment._get_file_writer().add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), step)
+        return None
+    if getattr(logger, "log_dir", None) is not None:
+        path = _folder(logger, "videos") / f"{name}_{step}.gif"
+        path.write_bytes(film)
+        return path
+    return None
+
+
+def encode_gif(frames: Tensor, fps: int = 10) -> bytes:
+    """Frames ``(T, 3, H, W)`` uint8 as the bytes of an endless gif.
+
+    Raises:
+        MissingDependencyError: if Pillow is not installed.
+
+    Source: none.
+    """
+    _need("PIL", "viz")
+    from PIL import Image
+
+    pictures = np.ascontiguousarray(frames.permute(0, 2, 3, 1).cpu().numpy())
+    pages = [Image.fromarray(picture).quantize(128) for picture in pictures]
+    out = io.BytesIO()
+    pages[0].save(out, "GIF", save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0)
+    return out.getvalue()
+
+
+def close_logger(logger: Any) -> None:
+    """Write what a logger still holds, and end a wandb run.
+
+    Args:
+        logger: TorchRL logger, or ``None``.
+
+    Source: none.
+    """
+    experiment: Any = getattr(logger, "experiment", None)
+    if type(logger).__name__ == "WandbLogger":
+        experiment.finish(quiet=True)
+    elif hasattr(experiment, "close"):
+        experiment.close()
+    else:
+        for file in getattr(experiment, "files", {}).values():
+            file.close()
+
+
+def _folder(logger: Any, kind: str) -> Path:
+    folder = Path(logger.log_dir) / logger.exp_name / kind
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def _need(module: str, extra: str) -> None:
+    import importlib.util
+
+    if sys.modules.get(module, ...) is None or importlib.util.find_spec(module) is None:
+        raise MissingDependencyError(
+            f"expected the package '{module}', found none; run `pip install 'torchrl-sspl[{extra}]'`"
+        )
+
+
+@contextmanager
+def _unchanged(variable: str) -> Iterator[None]:
+    """Leave a variable of the environment as it was; TorchRL's wandb logger sets one for good."""
+    before = os.environ.get(variable)
+    try:
+        yield
+    finally:
+        if before is None:
+            os.environ.pop(variable, None)
+        else:
+            os.environ[variable] = before
