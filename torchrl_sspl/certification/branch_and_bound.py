@@ -1,0 +1,411 @@
+r"""Branch and bound over a box: the largest value of an objective where a constraint holds, from both sides.
+
+All claims of the deterministic layer are of one form: the maximum, over the :math:`z \in Z` with
+:math:`c_- \le B(z) \le c_+`, of
+
+.. math:: \min_k \; (R_k F(z) - b_k B(z) + c_k)
+
+with F the closed loop :math:`z \mapsto B(d(z, \pi(z)))` (or :math:`d(z, \pi(z))` itself). A box is discarded as soon as
+one of these, tried in the order of their cost, shows that it is of no interest: the Lipschitz constant of B around its
+centre; linear bounds of B; the enclosure of :math:`d(z, \pi(z))` with the Lipschitz constant; linear bounds of F. The
+last two functions are used together: the linear programme "objective where B is at most :math:`c_+`" is solved exactly,
+and both half-spaces cut the box before it is split.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from torchrl_sspl.certification.graph import Graph
+from torchrl_sspl.certification.half_spaces import clip, programme
+from torchrl_sspl.certification.propagation import Enclosure, LinearBound
+from torchrl_sspl.errors import ConfigError
+
+#: What a bound must be better by before it decides; far above the rounding of float64.
+SLACK = 1e-6
+
+@dataclass(frozen=True)
+class Budget:
+    """When a search gives up.
+
+    Attributes:
+        boxes: number of boxes; when it runs out the result is the same on every machine.
+        seconds: wall-clock time.
+
+    Raises:
+        ConfigError: if one of them is negative.
+
+    Source: none.
+    """
+
+    boxes: int = 50_000_000
+    seconds: float = 900.0
+
+    def __post_init__(self) -> None:
+        if self.boxes < 0 or not self.seconds >= 0:
+            raise ConfigError(f"expected boxes >= 0 and seconds >= 0, received {self.boxes} and {self.seconds}")
+
+
+@dataclass
+class Problem:
+    """What is maximised, and where.
+
+    Attributes:
+        low: lower corner of the domain, ``(p,)`` float64.
+        high: upper corner, ``(p,)`` float64.
+        function: F, ``(n, p) -> (n, q)``.
+        rows: R, ``(K, q)``; nonnegative where ``inner`` is given.
+        barrier: B, ``(n, p) -> (n, 1)``.
+        barrier_weight: b, ``(K,)``, nonnegative.
+        constant: c, ``(K,)``.
+        level: :math:`c_+`, or None.
+        floor: :math:`c_-`, or None.
+        combine: "min" or "max" of the rows.
+        lipschitz: proved Lipschitz constant of B, or None.
+        inner: step of F that holds :math:`d(z, \\pi(z))` where F ends with B, else None.
+    """
+
+    low: Tensor
+    high: Tensor
+    function: Graph
+    rows: Tensor
+    barrier: Graph
+    barrier_weight: Tensor
+    constant: Tensor
+    level: float | None = None
+    floor: float | None = None
+    combine: str = "min"
+    lipschitz: float | None = None
+    inner: int | None = None
+
+    @property
+    def constrained(self) -> bool:
+        """Whether there is a constraint."""
+        return self.level is not None or self.floor is not None
+
+    def evaluate(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """Objective and barrier at points ``(n, p)``, each ``(n,)``."""
+        barrier = self.barrier(point)
+        return self.combined(self.function(point) @ self.rows.mT - barrier * self.barrier_weight + self.constant), barrier[:, 0]
+
+    def combined(self, parts: Tensor) -> Tensor:
+        """Objective from its rows ``(n, K)``."""
+        return parts.amin(1) if self.combine == "min" else parts.amax(1)
+
+    def feasible(self, barrier: Tensor) -> Tensor:
+        """Whether points with these barrier values ``(n,)`` count."""
+        inside = torch.ones_like(barrier, dtype=torch.bool)
+        if self.level is not None:
+            inside &= barrier <= self.level
+        if self.floor is not None:
+            inside &= barrier >= self.floor
+        return inside
+
+
+@dataclass
+class Outcome:
+    """Result of a search.
+
+    Attributes:
+        status: "proved" (the objective is at most ``upper`` everywhere), "refuted" (``witness`` shows the contrary) or
+            "undecided" (the budget was too small).
+        upper: the objective is at most this wherever the constraint holds, whatever the status.
+        lower: largest value that was found.
+        witness: where it was found, ``(p,)``, or None.
+        boxes: boxes bounded.
+        seconds: wall-clock time.
+        remaining_volume: share of the domain that is not decided.
+        depth: largest number of bisections of a box.
+    """
+
+    status: str
+    upper: float
+    lower: float
+    witness: Tensor | None
+    boxes: int
+    seconds: float
+    remaining_volume: float
+    depth: int
+
+
+def attack(
+    problem: Problem, *, samples: int = 32768, steps: int = 40, starts: int = 256, seed: int = 0
+) -> tuple[float, Tensor | None]:
+    """Looks for a point with a large objective: uniform samples, then projected gradient ascent from the best.
+
+    Args:
+        problem: what is maximised.
+        samples: number of samples.
+        steps: number of steps of the ascent.
+        starts: number of points that ascend.
+        seed: of the samples.
+
+    Returns:
+        Largest value found where the constraint holds, and the point ``(p,)``; -inf and None if there is no such point.
+
+    Source: none.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    span = problem.high - problem.low
+    points = problem.low + span * torch.rand(samples, len(span), generator=generator, dtype=span.dtype)
+    with torch.no_grad():
+        value, barrier = problem.evaluate(points)
+        inside = problem.feasible(barrier)
+        # The set may be small: where no sample lies in it, start from the deepest points.
+        small = problem.level is not None and not inside.any()
+        score = -barrier if small else torch.where(inside, value, -math.inf)
+    return ascend(problem, points[score.topk(min(starts, samples)).indices], steps=steps)
+
+
+def ascend(problem: Problem, start: Tensor, *, steps: int = 40) -> tuple[float, Tensor | None]:
+    """Projected gradient ascent of the objective, pulled back where the constraint fails.
+
+    Args:
+        problem: what is maximised.
+        start: ``(n, p)``.
+        steps: number of steps.
+
+    Returns:
+        Largest value met where the constraint holds, and the point ``(p,)``; -inf and None if there was none.
+
+    Source: none.
+    """
+    best, where = -math.inf, None
+    span = problem.high - problem.low
+    point = start
+    for k in range(steps + 1):
+        with torch.enable_grad():
+            x = point.detach().requires_grad_()
+            value, barrier = problem.evaluate(x)
+            outside = torch.zeros_like(barrier)
+            if problem.level is not None:
+                outside = outside + (barrier - problem.level).clamp_min(0.0)
+            if problem.floor is not None:
+                outside = outside + (problem.floor - barrier).clamp_min(0.0)
+            (gradient,) = torch.autograd.grad((value - 20.0 * outside).sum(), x)
+        score = torch.where(problem.feasible(barrier.detach()), value.detach(), -math.inf)
+        top = int(score.argmax())
+        if float(score[top]) > best:
+            best, where = float(score[top]), point[top].clone()
+        length = gradient.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        point = point + 0.05 * 0.85**k * span * gradient / length
+        point = torch.minimum(torch.maximum(point, problem.low), problem.high)
+    return best, where
+
+
+class _Boxes:
+    """The boxes that are left, with a bound of the objective on each."""
+
+    def __init__(self, low: Tensor, high: Tensor) -> None:
+        p, span = len(low), high - low
+        per_axis = max(2, round(512 ** (1.0 / p)))
+        # Every edge is computed once: neighbours share their faces to the last bit.
+        edges = low[:, None] + span[:, None] * torch.linspace(0.0, 1.0, per_axis + 1, dtype=low.dtype)
+        edges[:, -1] = high
+        self.low = torch.cartesian_prod(*edges[:, :-1]).reshape(-1, p)
+        self.high = torch.cartesian_prod(*edges[:, 1:]).reshape(-1, p)
+        self.upper = torch.full((len(self.low),), math.inf, dtype=low.dtype)
+        self.depth = torch.zeros(len(self.low), dtype=torch.int64)
+        self.domain = float(span.prod())
+
+    def __len__(self) -> int:
+        return len(self.low)
+
+    def take(self, n: int) -> tuple[Tensor, Tensor, Tensor]:
+        """Removes the n boxes with the highest bounds."""
+        keep = torch.zeros(len(self), dtype=torch.bool)
+        if n < len(self):
+            keep[:] = True
+            keep[self.upper.topk(n).indices] = False
+        taken = self.low[~keep], self.high[~keep], self.depth[~keep]
+        self.low, self.high, self.upper, self.depth = (t[keep] for t in (self.low, self.high, self.upper, self.depth))
+        return taken
+
+    def split(self, low: Tensor, high: Tensor, upper: Tensor, depth: Tensor, sensitivity: Tensor) -> None:
+        """Adds both halves of boxes, cut across the axis that matters most."""
+        axis = (sensitivity * (high - low)).argmax(1, keepdim=True)
+        middle = (0.5 * (low + high)).gather(1, axis)
+        self.low = torch.cat([self.low, low, low.scatter(1, axis, middle)])
+        self.high = torch.cat([self.high, high.scatter(1, axis, middle), high])
+        self.upper = torch.cat([self.upper, upper, upper])
+        self.depth = torch.cat([self.depth, depth + 1, depth + 1])
+
+    def volume(self) -> float:
+        """Share of the domain."""
+        return float((self.high - self.low).prod(1).sum()) / self.domain
+
+
+def _infeasible(problem: Problem, least: Tensor, most: Tensor, slack: float) -> Tensor:
+    """Whether no point of a box with B in ``[least, most]`` meets the constraint."""
+    out = torch.zeros_like(least, dtype=torch.bool)
+    if problem.level is not None:
+        out |= least > problem.level + slack
+    if problem.floor is not None:
+        out |= most < problem.floor - slack
+    return out
+
+
+def _bound(
+    q: Problem, low: Tensor, high: Tensor, threshold: float, slack: float, tight: bool
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """What is left of boxes: corners, upper bounds, sensitivity per axis, and which of the given boxes it was.
+
+    A comparison with a bound that is not a number keeps the box.
+    """
+    limit = threshold - slack
+    kept = torch.arange(len(low))
+    constraints: list[LinearBound] = []  # functions that are at most zero wherever the constraint holds
+    below = None  # above -B
+    if q.constrained or bool(q.barrier_weight.any()):
+        if q.lipschitz is not None and q.constrained:
+            value = q.barrier(0.5 * (low + high))[:, 0]
+            reach = q.lipschitz * (0.5 * (high - low)).norm(dim=1)
+            keep = ~_infeasible(q, value - reach, value + reach, slack)
+            low, high, kept = low[keep], high[keep], kept[keep]
+        box = Enclosure(q.barrier, low, high, tight=tight)
+        both = box.upper(torch.tensor([[-1.0], [1.0]], dtype=torch.float64))
+        ends = both.upper(box.radius)
+        keep = ~_infeasible(q, -ends[:, 0], ends[:, 1], slack)
+        low, high, kept, both = low[keep], high[keep], kept[keep], both.select(keep)
+        below, above_b = (LinearBound(both.slope[:, k : k + 1], both.value[:, k : k + 1], both.center) for k in (0, 1))
+        if q.level is not None:
+            constraints.append(LinearBound(-below.slope, -below.value - q.level - slack, below.center))
+        if q.floor is not None:
+            constraints.append(LinearBound(-above_b.slope, q.floor - slack - above_b.value, above_b.center))
+        for c in constraints:
+            low, high = clip(low, high, c)
+
+    inner = Enclosure(q.function, low, high, until=q.inner, tight=tight)
+    first = torch.full((len(low), len(q.rows)), math.inf, dtype=low.dtype)
+    if q.inner is not None and q.lipschitz is not None:
+        least, most = inner.interval(q.inner)
+        least, most = least.clamp_min(-1.0), most.clamp_max(1.0)
+        reach = q.lipschitz * (0.5 * (most - least)).norm(dim=1)
+        first = (q.barrier(0.5 * (least + most)) + reach[:, None]) @ q.rows.mT + q.constant
+        if below is not None and bool(q.barrier_weight.any()):
+            first = first + q.barrier_weight * below.at(inner.center).upper(inner.radius)
+        keep = ~(q.combined(first) <= limit)
+        low, high, kept, first, inner = low[keep], high[keep], kept[keep], first[keep], inner.select(keep)
+        constraints = [c.select(keep) for c in constraints]
+        below = None if below is None else below.select(keep)
+    inner.extend()
+    above = inner.upper(q.rows)
+    slope, value = above.slope, above.value + q.constant
+    if below is not None and bool(q.barrier_weight.any()):
+        here = below.at(above.center)
+        slope, value = slope + q.barrier_weight[:, None] * here.slope, value + q.barrier_weight * here.value
+    above = LinearBound(slope, value, above.center)
+    parts = torch.minimum(first, above.upper(inner.radius))
+    for c in constraints:
+        parts = torch.minimum(parts, programme(above, c.at(above.center), inner.radius))
+    upper = q.combined(parts)
+    keep = ~(upper <= limit)
+    low, high, kept, upper, above = low[keep], high[keep], kept[keep], upper[keep], above.select(keep)
+    if q.combine == "min" or len(q.rows) == 1:
+        for k in range(len(q.rows)):
+            row = LinearBound(-above.slope[:, k : k + 1], limit - above.value[:, k : k + 1], above.center)
+            low, high = clip(low, high, row)
+    last = len(q.function.steps) - 1 if q.inner is None else q.inner
+    sensitivity = inner.slope(last)[keep].norm(dim=2) if last in q.function.interfaces else above.slope.abs().amax(1)
+    sensitivity = sensitivity + 0.1 * sensitivity.amax(1, keepdim=True) + 1e-9
+    return low, high, upper, sensitivity, kept
+
+
+@torch.no_grad()
+def maximise(
+    problem: Problem,
+    *,
+    threshold: float | None = None,
+    stop_above: float = math.inf,
+    tolerance: float = 1e-3,
+    budget: Budget | None = None,
+    slack: float = SLACK,
+    batch: int = 1024,
+    seed: int = 0,
+    tight: bool = False,
+    confirm: Callable[[Tensor], bool] | None = None,
+    progress: bool = False,
+) -> Outcome:
+    """Largest objective where the constraint holds, or a proof that it does not exceed a threshold.
+
+    With a threshold the search ends as soon as that is proved or refuted. Without one it closes in on the maximum from
+    both sides until they are no more than the tolerance apart.
+
+    Args:
+        problem: what is maximised.
+        threshold: value to prove.
+        stop_above: end, "refuted", as soon as a value above this is found (without a threshold).
+        tolerance: largest distance of the two sides in the end (without a threshold).
+        budget: when to give up.
+        slack: what a bound must be better by before it decides.
+        batch: boxes at a time.
+        seed: of the samples.
+        tight: backward bounds for all undecided activations.
+        confirm: whether a point ``(p,)`` is a counterexample for the networks as they are deployed too; a point that is
+            none does not refute.
+        progress: show a progress bar.
+
+    Returns:
+        The outcome; the same for the same arguments unless the time runs out.
+
+    Source: none (branch and bound).
+
+    Example:
+        >>> graph, zero = Graph(1), torch.zeros(1, dtype=torch.float64)
+        >>> _ = graph.linear([0], [torch.tensor([[2.0]])])
+        >>> one = torch.ones(1, 1, dtype=torch.float64)
+        >>> problem = Problem(-one[0], one[0], graph, one, graph, zero, zero, level=0.5)  # 2 z where 2 z <= 0.5
+        >>> outcome = maximise(problem)
+        >>> outcome.status, abs(outcome.upper - 0.5) < 2e-3
+        ('proved', True)
+    """
+    start, budget = time.monotonic(), budget or Budget()
+    left = _Boxes(problem.low, problem.high)
+    lower, witness = attack(problem, seed=seed)
+    goal = lower + tolerance if threshold is None else threshold
+    count = deepest = 0
+
+    def outcome(status: str) -> Outcome:
+        upper = max(goal, float(left.upper.max())) if len(left) else goal
+        return Outcome(status, upper, lower, witness, count, time.monotonic() - start, left.volume(), deepest)
+
+    def refuted() -> bool:
+        limit = stop_above if threshold is None else threshold
+        return lower > limit and witness is not None and (confirm is None or confirm(witness))
+
+    bar = tqdm(total=1.0, disable=not progress, bar_format="{l_bar}{bar}| {n:.4f} of the domain [{elapsed}<{remaining}]")
+    with bar:
+        if refuted():
+            return outcome("refuted")
+        while len(left):
+            if count >= budget.boxes or time.monotonic() - start >= budget.seconds:
+                return outcome("undecided")
+            low, high, depth = left.take(min(batch, budget.boxes - count))
+            count += len(low)
+            low, high, upper, sensitivity, kept = _bound(problem, low, high, goal, slack, tight)
+            if len(low):
+                center = 0.5 * (low + high)
+                value, barrier = problem.evaluate(center)
+                value = torch.where(problem.feasible(barrier), value, -math.inf)
+                if float(value.max()) > lower:
+                    lower, witness = float(value.max()), center[int(value.argmax())].clone()
+                    better, place = ascend(problem, center[value.topk(min(32, len(value))).indices], steps=20)
+                    if better > lower:
+                        lower, witness = better, place
+                    goal = max(goal, lower + tolerance) if threshold is None else threshold
+                    if refuted():
+                        left.split(low, high, upper, depth[kept], sensitivity)
+                        return outcome("refuted")
+                left.split(low, high, upper, depth[kept], sensitivity)
+                deepest = max(deepest, int(depth[kept].max()) + 1)
+            if progress:
+                bar.n = max(0.0, 1.0 - left.volume())
+                bar.refresh()
+    return outcome("proved")

@@ -1,0 +1,554 @@
+r"""The conditions of a barrier certificate, decided for frozen networks on the whole latent domain.
+
+All statements are about the closed loop of latent dynamics and policy, :math:`z^+ = d(z, \pi(z))`, on a box that the
+encoder cannot leave. Each is proved, refuted with a counterexample, or undecided with what remains.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sspl.certification.activations import Activation, clamp
+from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, Outcome, Problem, maximise
+from torchrl_sspl.certification.graph import Apply, Graph
+from torchrl_sspl.certification.propagation import rounding_bound
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.lipschitz import lipschitz_upper
+
+CONDITIONS = ("R3", "R1", "R2")
+
+
+@dataclass(frozen=True)
+class ClosedLoop:
+    """Frozen networks in the form in which bounds propagate through them.
+
+    Attributes:
+        barrier: B, ``(n, p) -> (n, 1)``.
+        step: :math:`d(z, \\pi(z))`, ``(n, p) -> (n, p)``.
+        looped: :math:`B(d(z, \\pi(z)))`, ``(n, p) -> (n, 1)``.
+        inner: number of the step of ``looped`` that holds :math:`d(z, \\pi(z))`.
+        lipschitz_bound: proved Lipschitz constant of B.
+        low: lower corner of the domain, ``(p,)`` float64.
+        high: upper corner, ``(p,)`` float64.
+    """
+
+    barrier: Graph
+    step: Graph
+    looped: Graph
+    inner: int
+    lipschitz_bound: float
+    low: Tensor
+    high: Tensor
+
+    @property
+    def latent_dim(self) -> int:
+        """Size of the latent."""
+        return self.barrier.input_dim
+
+    def problem(
+        self, *, level: float | None, weight: Sequence[float] = (0.0,), constant: Sequence[float] = (0.0,)
+    ) -> Problem:
+        """Maximum of :math:`\\min_k B(d(z, \\pi(z))) - b_k B(z) + c_k` where B is at most a level.
+
+        Args:
+            level: of B; None for no constraint.
+            weight: :math:`b_k`, nonnegative.
+            constant: :math:`c_k`.
+
+        Returns:
+            The problem.
+        """
+        rows = torch.ones(len(weight), 1, dtype=torch.float64)
+        # An infinite constant would turn the cheap tests into comparisons with infinity and NaN.
+        known = self.lipschitz_bound if math.isfinite(self.lipschitz_bound) else None
+        return Problem(
+            self.low,
+            self.high,
+            self.looped,
+            rows,
+            self.barrier,
+            torch.tensor(list(weight), dtype=torch.float64),
+            torch.tensor(list(constant), dtype=torch.float64),
+            level=level,
+            lipschitz=known,
+            inner=self.inner,
+        )
+
+
+def closed_loop(
+    barrier: nn.Module,
+    dynamics: nn.Module,
+    policy: nn.Module,
+    *,
+    latent_dim: int,
+    lipschitz_bound: float,
+    low: float | Tensor = -1.0,
+    high: float | Tensor = 1.0,
+) -> ClosedLoop:
+    r"""The closed loop of frozen networks.
+
+    .. math:: u = s \operatorname{clamp}(\operatorname{net}_\pi(z), -1, 1), \qquad
+        z^+ = \operatorname{clamp}(z + \operatorname{net}_d(z, u / s), -1, 1)
+
+    Args:
+        barrier: ``nn.Sequential`` of linear layers and activations (or a module with ``collapse()``), p inputs, 1 output.
+        dynamics: module in the form above, with ``net`` and ``action_scale``; or a plain ``nn.Sequential`` of
+            ``(z, u)``, p + m inputs and p outputs, taken as it is.
+        policy: module in the form above; or a plain ``nn.Sequential``, p inputs and m outputs.
+        latent_dim: p.
+        lipschitz_bound: proved Lipschitz constant of the barrier (``math.inf`` where none is known).
+        low: lower corner of the domain, a number or ``(p,)``.
+        high: upper corner.
+
+    Returns:
+        The closed loop.
+
+    Raises:
+        ConfigError: if a module is of neither form, the action scales differ, or the domain is empty.
+        ShapeError: if the networks do not fit each other.
+        NonFiniteError: if a weight is NaN or infinite.
+
+    Source: paper eq. (8)-(9), composed; deviation: none.
+
+    Example:
+        >>> half = nn.Linear(2, 2, bias=False)  # z+ = z / 2
+        >>> _ = half.weight.data.copy_(0.5 * torch.eye(2))
+        >>> plant = nn.Sequential(nn.Linear(3, 2, bias=False))
+        >>> _ = plant[0].weight.data.copy_(torch.cat([0.5 * torch.eye(2), torch.zeros(2, 1)], 1))
+        >>> system = closed_loop(nn.Sequential(nn.Linear(2, 1)), plant, nn.Sequential(nn.Linear(2, 1)), latent_dim=2,
+        ...                      lipschitz_bound=math.inf)
+        >>> system.step(torch.ones(1, 2)).tolist()
+        [[0.5, 0.5]]
+    """
+    corners = [torch.as_tensor(c, dtype=torch.float64).expand(latent_dim).clone() for c in (low, high)]
+    if not bool((corners[0] < corners[1]).all()):
+        raise ConfigError(f"expected low < high in every dimension, received {corners[0].tolist()}, {corners[1].tolist()}")
+    if not lipschitz_bound > 0:
+        raise ConfigError(f"expected a positive Lipschitz bound of the barrier, received {lipschitz_bound}")
+    scales = [getattr(m, "action_scale", None) for m in (dynamics, policy)]
+    if all(s is not None for s in scales) and not torch.equal(*scales):  # type: ignore[arg-type]
+        raise ConfigError(f"expected one action scale in dynamics and policy, received {scales[0]} and {scales[1]}")
+
+    def append_step(graph: Graph) -> int:
+        action = _append_policy(graph, policy)
+        return _append_dynamics(graph, dynamics, action)
+
+    alone, step, looped = Graph(latent_dim), Graph(latent_dim), Graph(latent_dim)
+    alone.network(0, barrier)
+    append_step(step)
+    inner = append_step(looped)
+    looped.network(inner, barrier)
+    if alone.output_dim != 1 or step.output_dim != latent_dim:
+        raise ConfigError(
+            f"expected a barrier of one output and dynamics of {latent_dim}, received {alone.output_dim} and "
+            f"{step.output_dim}"
+        )
+    return ClosedLoop(alone, step, looped, inner, float(lipschitz_bound), *corners)
+
+
+def _append_policy(graph: Graph, policy: nn.Module) -> int:
+    """Appends the policy; the result is the action in units of the dynamics' network."""
+    if isinstance(policy, nn.Sequential):
+        return graph.interface(graph.network(0, policy))
+    net = _net(policy, "policy")
+    return graph.interface(graph.apply(graph.network(0, net), clamp()))
+
+
+def _append_dynamics(graph: Graph, dynamics: nn.Module, action: int) -> int:
+    plain = isinstance(dynamics, nn.Sequential)
+    net = cast(nn.Sequential, dynamics if plain else _net(dynamics, "dynamics"))
+    p = graph.input_dim
+    layers = list(net)
+    first = layers[0]
+    if type(first) is not nn.Linear:
+        raise ConfigError(f"expected the dynamics to start with a linear layer, received {type(first).__name__}")
+    hidden = graph.linear([0, action], [first.weight[:, :p], first.weight[:, p:]], first.bias)
+    if plain:
+        return graph.interface(graph.network(hidden, nn.Sequential(*layers[1:])))
+    last = layers[-1]
+    if len(layers) == 1 or type(last) is not nn.Linear:
+        raise ConfigError("expected the dynamics' network to start and end with different linear layers")
+    hidden = graph.network(hidden, nn.Sequential(*layers[1:-1]))
+    moved = graph.linear([0, hidden], [torch.eye(p), last.weight], last.bias)
+    return graph.interface(graph.apply(moved, clamp()))
+
+
+def _net(module: nn.Module, name: str) -> nn.Sequential:
+    net = getattr(module, "net", None)
+    if not isinstance(net, nn.Sequential) or not hasattr(module, "action_scale"):
+        raise ConfigError(
+            f"expected the {name} to be an nn.Sequential, or a module with an nn.Sequential 'net' and an 'action_scale' "
+            f"(modules.LatentDynamics, modules.Policy), received {type(module).__name__}"
+        )
+    return net
+
+
+def decide_invariance(
+    system: ClosedLoop,
+    *,
+    condition: str = "R3",
+    level: float = 0.0,
+    margin: float = 0.0,
+    decay: float = 0.0,
+    decrement: float = 0.0,
+    floor: float = 0.0,
+    budget: Budget | None = None,
+    confirm: Callable[[Tensor], bool] | None = None,
+    progress: bool = False,
+) -> Outcome:
+    r"""Decides [V]: the set :math:`\{B \le s\}` is kept, with a margin.
+
+    .. math:: B(z) \le s \;\Rightarrow\; \begin{cases}
+        B(d(z, \pi(z))) + m \le s & \text{R3} \\
+        B(d(z, \pi(z))) + m \le (1 - \alpha) B(z) & \text{R1} \\
+        B(d(z, \pi(z))) + m \le \max(B(z) - \gamma, -c) & \text{R2} \end{cases}
+
+    Args:
+        system: the closed loop.
+        condition: "R3", "R1" or "R2".
+        level: s, barrier units.
+        margin: m, barrier units.
+        decay: :math:`\alpha \in [0, 1]` of R1.
+        decrement: :math:`\gamma \ge 0` of R2, barrier units.
+        floor: c of R2, barrier units.
+        budget: when to give up.
+        confirm: whether a point ``(p,)`` is a counterexample for the deployed networks too.
+        progress: show a progress bar.
+
+    Returns:
+        The outcome; ``upper`` bounds left side minus right side.
+
+    Raises:
+        ConfigError: if the condition is unknown or a parameter is out of range.
+
+    Source: paper eq. (5); deviation: on the set instead of everywhere, on the whole latent domain instead of samples.
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2 + 0 u
+        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
+        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
+        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
+        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
+        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> decide_invariance(system, margin=0.2).status, decide_invariance(system, margin=0.3).status
+        ('proved', 'refuted')
+    """
+    if condition not in CONDITIONS:
+        raise ConfigError(f"expected condition to be one of {', '.join(CONDITIONS)}, received {condition!r}")
+    if not 0.0 <= decay <= 1.0 or decrement < 0.0 or not math.isfinite(level + margin + floor):
+        raise ConfigError(
+            f"expected 0 <= decay <= 1, decrement >= 0 and finite level, margin and floor, received decay={decay}, "
+            f"decrement={decrement}, level={level}, margin={margin}, floor={floor}"
+        )
+    if condition == "R3":
+        problem = system.problem(level=level, constant=(margin - level,))
+    elif condition == "R1":
+        problem = system.problem(level=level, weight=(1.0 - decay,), constant=(margin,))
+    else:
+        problem = system.problem(level=level, weight=(1.0, 0.0), constant=(margin + decrement, margin + floor))
+    return maximise(problem, threshold=0.0, budget=budget, confirm=confirm, progress=progress)
+
+
+@dataclass(frozen=True)
+class LargestError:
+    r"""How large a latent error the invariance tolerates.
+
+    Attributes:
+        delta: proved: for errors up to this (latent units) the set is kept; negative: it is not kept even without any.
+        refuted_above: for errors above this a counterexample was found (of the Lipschitz argument, not of the system).
+        outcome: the search behind it.
+    """
+
+    delta: float
+    refuted_above: float
+    outcome: Outcome
+
+
+def largest_error(
+    system: ClosedLoop, *, level: float = 0.0, tolerance: float = 1e-3, budget: Budget | None = None, progress: bool = False
+) -> LargestError:
+    r"""Largest error of the latent dynamics for which :math:`\{B \le s\}` is kept.
+
+    .. math:: \delta^* = - \frac{1}{L_B} \max_{B(z) \le s} \left( B(d(z, \pi(z))) - s \right)
+
+    Args:
+        system: the closed loop.
+        level: s, barrier units.
+        tolerance: distance of the two sides of the maximum at which the search ends, barrier units.
+        budget: when to give up.
+        progress: show a progress bar.
+
+    Returns:
+        The error, from both sides.
+
+    Source: none (the paper estimates the error and asks for the margin; here the margin is computed and the error is
+    compared with it).
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
+        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
+        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
+        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
+        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
+        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> abs(largest_error(system).delta - 0.25) < 2e-3
+        True
+    """
+    if not math.isfinite(system.lipschitz_bound):
+        raise ConfigError("expected a finite Lipschitz bound of the barrier, received infinity; prove one first")
+    found = maximise(
+        system.problem(level=level, constant=(-level,)), tolerance=tolerance, budget=budget, progress=progress
+    )
+    # What decides, decides by more than the slack.
+    return LargestError(
+        -(found.upper + SLACK) / system.lipschitz_bound, -found.lower / system.lipschitz_bound, found
+    )
+
+
+def decide_domain(system: ClosedLoop, *, budget: Budget | None = None) -> Outcome:
+    r"""Decides whether :math:`d(z, \pi(z))` stays in the latent domain.
+
+    Args:
+        system: the closed loop.
+        budget: when to give up.
+
+    Returns:
+        The outcome; a clamp to the domain proves it at once.
+
+    Source: none (the paper's latent space is unbounded).
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
+        >>> _ = plant[0].weight.data.copy_(torch.tensor([[1.5, 0.0]]))
+        >>> system = closed_loop(nn.Sequential(nn.Linear(1, 1)), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1,
+        ...                      lipschitz_bound=math.inf)
+        >>> decide_domain(system).status
+        'refuted'
+    """
+    last = system.step.steps[-1]
+    if isinstance(last, Apply) and _within(last.activation, system):
+        return Outcome("proved", 0.0, -math.inf, None, 0, 0.0, 0.0, 0)
+    p = system.latent_dim
+    eye = torch.eye(p, dtype=torch.float64)
+    problem = Problem(
+        system.low,
+        system.high,
+        system.step,
+        torch.cat([eye, -eye]),
+        system.barrier,
+        torch.zeros(2 * p, dtype=torch.float64),
+        torch.cat([-system.high, system.low]),
+        combine="max",
+    )
+    return maximise(problem, threshold=0.0, budget=budget)
+
+
+def _within(activation: Activation, system: ClosedLoop) -> bool:
+    ends = torch.tensor([-math.inf, math.inf], dtype=torch.float64)
+    below, above = (float(v) for v in activation.value(ends))
+    return bool((system.low <= below).all()) and bool((system.high >= above).all())
+
+
+@dataclass(frozen=True)
+class Vacuity:
+    """Whether a statement about :math:`\\{B \\le s\\}` says anything.
+
+    Attributes:
+        status: "neither" (both points exist), "empty" (proved), "everything" (proved) or "undecided".
+        inside: a point with B below s, ``(p,)``, or None.
+        outside: a point with B above s, ``(p,)``, or None.
+    """
+
+    status: str
+    inside: Tensor | None
+    outside: Tensor | None
+
+
+def decide_vacuity(system: ClosedLoop, *, level: float = 0.0, budget: Budget | None = None) -> Vacuity:
+    r"""Decides whether :math:`\{B \le s\}` is empty, everything, or neither.
+
+    Args:
+        system: the closed loop.
+        level: s, barrier units.
+        budget: when to give up.
+
+    Returns:
+        The verdict with its witnesses.
+
+    Source: none; a barrier that is negative everywhere meets the paper's third condition without saying anything.
+
+    Example:
+        >>> system = closed_loop(nn.Sequential(nn.Linear(1, 1)), nn.Sequential(nn.Linear(2, 1)),
+        ...                      nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=math.inf)
+        >>> decide_vacuity(system, level=-100.0).status
+        'empty'
+    """
+    zero = torch.zeros(1, dtype=torch.float64)
+
+    def side(sign: float) -> tuple[bool, Tensor | None]:
+        """Whether sign (B - s) can be positive, with a point; None and True: not decided."""
+        rows = torch.full((1, 1), sign, dtype=torch.float64)
+        problem = Problem(system.low, system.high, system.barrier, rows, system.barrier, zero, zero - sign * level)
+        found = maximise(problem, threshold=0.0, budget=budget)
+        return found.status != "proved", found.witness if found.status == "refuted" else None
+
+    may_lie_inside, inside = side(-1.0)
+    may_lie_outside, outside = side(1.0)
+    if not may_lie_inside:
+        return Vacuity("empty", None, outside)
+    if not may_lie_outside:
+        return Vacuity("everything", inside, None)
+    return Vacuity("neither" if inside is not None and outside is not None else "undecided", inside, outside)
+
+
+def search_level(
+    system: ClosedLoop, *, levels: Sequence[float], margin: float = 0.0, budget: Budget | None = None
+) -> tuple[float, Outcome] | None:
+    r"""The first of several levels for which :math:`\{B \le s\}` is kept (R3).
+
+    Args:
+        system: the closed loop.
+        levels: s in the order in which they are tried, all at most zero; usually descending.
+        margin: m, barrier units.
+        budget: when to give up on one level.
+
+    Returns:
+        Level and outcome, or None if none is proved.
+
+    Raises:
+        ConfigError: if a level is positive.
+
+    Source: none.
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
+        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
+        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
+        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
+        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
+        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> search_level(system, levels=[0.0, -0.1], margin=0.2)[0]
+        0.0
+    """
+    if any(level > 0 for level in levels):
+        raise ConfigError(f"expected levels of at most zero, received {list(levels)}; above zero a set may touch U")
+    for level in levels:
+        outcome = decide_invariance(system, level=level, margin=margin, budget=budget)
+        if outcome.status == "proved":
+            return level, outcome
+    return None
+
+
+def deployment_rounding(system: ClosedLoop, *, per_axis: int = 8) -> float:
+    r"""How far the float32 networks, as deployed, can be from the exact ones: in B, in :math:`B(d(z, \pi(z)))`.
+
+    Args:
+        system: the closed loop.
+        per_axis: the domain is bounded in this many pieces per dimension.
+
+    Returns:
+        Largest bound of :math:`|\hat B(\hat d(z, \hat \pi(z))) - B(d(z, \pi(z)))|` over the domain, barrier units.
+
+    Source: Higham 2002, section 3.1.
+
+    Example:
+        >>> system = closed_loop(nn.Sequential(nn.Linear(1, 1)), nn.Sequential(nn.Linear(2, 1)),
+        ...                      nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=math.inf)
+        >>> 0.0 < deployment_rounding(system) < 1e-5
+        True
+    """
+    edges = [torch.linspace(float(a), float(b), per_axis + 1, dtype=torch.float64) for a, b in zip(system.low, system.high, strict=True)]
+    low = torch.cartesian_prod(*[e[:-1] for e in edges]).reshape(-1, system.latent_dim)
+    high = torch.cartesian_prod(*[e[1:] for e in edges]).reshape(-1, system.latent_dim)
+    parts = zip(low.split(512), high.split(512), strict=True)
+    return max(float(rounding_bound(system.looped, a, b)[-1].max()) for a, b in parts)
+
+
+def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
+    r"""Certified Lipschitz constant of :math:`z \mapsto d(z, \pi(z))`.
+
+    .. math:: L_{cl} \le 1 + L_{net_d} \sqrt{1 + L_{net_\pi}^2}
+
+    Args:
+        dynamics: module with ``net`` and ``action_scale`` (a residual network between clamps).
+        policy: module with ``net`` and ``action_scale``.
+
+    Returns:
+        The bound; clamps are 1-Lipschitz.
+
+    Raises:
+        ConfigError: if a module is of another form.
+
+    Source: none; the constant that paper Theorem 1 leaves out.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> class Part(nn.Module):
+        ...     def __init__(self, n):
+        ...         super().__init__()
+        ...         self.net, self.action_scale = nn.Sequential(nn.Linear(n, 1)), torch.ones(1)
+        >>> closed_loop_lipschitz(Part(2), Part(1)) > 1
+        True
+    """
+    loop, control = (float(lipschitz_upper(_net(m, n))) for m, n in ((dynamics, "dynamics"), (policy, "policy")))
+    return 1.0 + loop * math.sqrt(1.0 + control * control)
+
+
+def find_counterexamples(
+    system: ClosedLoop,
+    n: int,
+    *,
+    level: float = 0.0,
+    margin: float = 0.0,
+    samples: int = 50_000,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    r"""Points of the domain at which the invariance fails, for training on them.
+
+    .. math:: B(z) \le s, \qquad B(d(z, \pi(z))) + m > s
+
+    Args:
+        system: the closed loop.
+        n: largest number of points.
+        level: s, barrier units.
+        margin: m, barrier units.
+        samples: uniform samples, of which the worst are improved by gradient steps.
+        generator: source of randomness.
+
+    Returns:
+        ``(k, p)`` float32, the worst first, ``k <= n``; empty if none was found.
+
+    Source: none (counterexample-guided training).
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
+        >>> _ = plant[0].weight.data.copy_(torch.tensor([[1.5, 0.0]]))  # z+ = 1.5 z
+        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
+        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
+        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
+        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> bool((find_counterexamples(system, 10).abs() > 0.33).all())
+        True
+    """
+    problem = system.problem(level=level, constant=(margin - level,))
+    span = system.high - system.low
+    points = system.low + span * torch.rand(samples, len(span), generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        points = points[problem.feasible(system.barrier(points)[:, 0])]
+        if not len(points):
+            return torch.zeros(0, system.latent_dim)
+        value = problem.evaluate(points)[0]
+        worst = points[value.topk(min(n, len(points))).indices]
+        steps = 0.02 * span * torch.randn(4, *worst.shape, generator=generator, dtype=torch.float64)
+        near = torch.minimum(torch.maximum(worst + steps, system.low), system.high).flatten(0, 1)
+        points = torch.cat([worst, near])
+        value, barrier = problem.evaluate(points)
+        bad = points[problem.feasible(barrier) & (value > 0)]
+        order = problem.evaluate(bad)[0].argsort(descending=True) if len(bad) else torch.zeros(0, dtype=torch.int64)
+    return bad[order][:n].float()

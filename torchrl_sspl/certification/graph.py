@@ -1,0 +1,225 @@
+r"""Composed networks as a list of two kinds of steps: sums of linear maps, and activations.
+
+A step may take the output of any earlier one, so that skip connections (:math:`z + f(z, \pi(z))`) stay what they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sspl.certification.activations import Activation, activation_of
+from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+
+
+@dataclass(frozen=True)
+class Affine:
+    r"""Step :math:`\sum_k W_k x_k + b`.
+
+    Attributes:
+        sources: numbers of the steps whose outputs :math:`x_k` are taken.
+        weights: :math:`W_k`, each ``(out, in_k)``, float64.
+        bias: ``(out,)``, float64.
+    """
+
+    sources: tuple[int, ...]
+    weights: tuple[Tensor, ...]
+    bias: Tensor
+
+
+@dataclass(frozen=True)
+class Apply:
+    """Step that applies an activation to every entry.
+
+    Attributes:
+        source: number of the step whose output is taken.
+        activation: the function.
+    """
+
+    source: int
+    activation: Activation
+
+
+@dataclass
+class Graph:
+    """Function of a vector, as steps; step 0 is the input, the last step is the output.
+
+    Weights are taken in float64; float32 weights are represented exactly.
+
+    Args:
+        input_dim: size of the input.
+        dtype: dtype of the bounds, float64 unless there is a reason.
+
+    Source: none.
+
+    Example:
+        >>> graph = Graph(2)
+        >>> hidden = graph.network(0, nn.Sequential(nn.Linear(2, 8), nn.ReLU(), nn.Linear(8, 2)))
+        >>> _ = graph.linear([0, hidden], [torch.eye(2), torch.eye(2)])  # z + f(z)
+        >>> graph(torch.zeros(5, 2)).shape
+        torch.Size([5, 2])
+    """
+
+    input_dim: int
+    dtype: torch.dtype = torch.float64
+    steps: list[Affine | Apply | None] = field(default_factory=lambda: [None])
+    sizes: list[int] = field(default_factory=list)
+    activated: set[int] = field(default_factory=set)  # steps to which an activation is applied
+    interfaces: set[int] = field(default_factory=set)  # steps of few numbers, at which bounds are made tight
+    last_use: dict[int, list[int]] = field(default_factory=dict)  # step -> the steps that are needed for it for the last time
+
+    def __post_init__(self) -> None:
+        self.sizes = [self.input_dim]
+
+    @property
+    def output_dim(self) -> int:
+        """Size of the last step."""
+        return self.sizes[-1]
+
+    def linear(self, sources: Sequence[int], weights: Sequence[Tensor], bias: Tensor | None = None) -> int:
+        """Appends a sum of linear maps.
+
+        Args:
+            sources: numbers of the steps that are taken.
+            weights: one ``(out, in)`` matrix for each.
+            bias: ``(out,)``; zero if not given.
+
+        Returns:
+            Number of the new step.
+
+        Raises:
+            ShapeError: if the shapes do not fit.
+            NonFiniteError: if a weight is NaN or infinite.
+        """
+        matrices = tuple(w.detach().to(self.dtype).cpu() for w in weights)
+        out = matrices[0].shape[0]
+        offset = torch.zeros(out, dtype=self.dtype) if bias is None else bias.detach().to(self.dtype).cpu()
+        for source, matrix in zip(sources, matrices, strict=True):
+            if matrix.shape != (out, self.sizes[source]) or offset.shape != (out,):
+                raise ShapeError(
+                    f"expected weights of shape ({out}, {self.sizes[source]}) and a bias of {out}, received "
+                    f"{tuple(matrix.shape)} and {tuple(offset.shape)}; the networks do not fit each other"
+                )
+        if not all(bool(t.isfinite().all()) for t in (*matrices, offset)):
+            raise NonFiniteError("expected finite weights, received NaN or infinity; the network cannot be certified")
+        return self._append(Affine(tuple(sources), matrices, offset), out, sources)
+
+    def apply(self, source: int, activation: Activation) -> int:
+        """Appends an activation.
+
+        Args:
+            source: number of the step that is taken.
+            activation: the function.
+
+        Returns:
+            Number of the new step.
+        """
+        self.activated.add(source)
+        return self._append(Apply(source, activation), self.sizes[source], [source])
+
+    def interface(self, step: int) -> int:
+        """Marks a step of few numbers, at which bound propagation makes its bounds tight.
+
+        Args:
+            step: its number.
+
+        Returns:
+            The same number.
+        """
+        self.interfaces.add(step)
+        return step
+
+    def undecided(self, step: int, low: Tensor, high: Tensor) -> Tensor:
+        """Entries of a step on which its activations are not linear between two bounds, ``(n, size)`` bool."""
+        result = torch.zeros_like(low, dtype=torch.bool)
+        for later in self.steps[step:]:
+            if isinstance(later, Apply) and later.source == step:
+                if later.activation.curvature:
+                    return torch.ones_like(result)
+                for knot in later.activation.knots:
+                    result |= (low < knot) & (high > knot)
+        return result
+
+    def _append(self, step: Affine | Apply, size: int, sources: Sequence[int]) -> int:
+        self.steps.append(step)
+        self.sizes.append(size)
+        number = len(self.steps) - 1
+        for used in self.last_use.values():
+            used[:] = [s for s in used if s not in sources]
+        self.last_use[number] = list(sources)
+        return number
+
+    def network(self, source: int, network: nn.Module) -> int:
+        """Appends the layers of a plain network.
+
+        Args:
+            source: number of the step that is taken.
+            network: ``nn.Sequential`` (possibly nested) of linear layers and activations, or a module with a
+                ``collapse()`` method that gives one.
+
+        Returns:
+            Number of the last new step.
+
+        Raises:
+            ConfigError: if a layer is of another kind.
+            ShapeError: if the layers do not fit each other.
+            NonFiniteError: if a weight is NaN or infinite.
+        """
+        for layer in _layers(network):
+            if type(layer) is nn.Linear:
+                source = self.linear([source], [layer.weight], layer.bias)
+            elif type(layer) is not nn.Identity:
+                source = self.apply(source, activation_of(layer))
+        return source
+
+    def values(self, point: Tensor) -> list[Tensor]:
+        """Outputs of all steps at points.
+
+        Args:
+            point: ``(n, input_dim)``.
+
+        Returns:
+            One ``(n, size)`` per step.
+
+        Raises:
+            ShapeError: if the shape is another one.
+        """
+        if point.ndim != 2 or point.shape[1] != self.input_dim:
+            raise ShapeError(f"expected points of shape (n, {self.input_dim}), received {tuple(point.shape)}")
+        values = [point.to(self.dtype)]
+        for step in self.steps[1:]:
+            if isinstance(step, Apply):
+                values.append(step.activation.value(values[step.source]))
+            elif isinstance(step, Affine):
+                first, *rest = zip(step.sources, step.weights, strict=True)
+                total = torch.addmm(step.bias, values[first[0]], first[1].mT)
+                for source, weight in rest:
+                    total = total.addmm(values[source], weight.mT)
+                values.append(total)
+        return values
+
+    def __call__(self, point: Tensor) -> Tensor:
+        """Value of the function at points, ``(n, input_dim) -> (n, output_dim)``."""
+        return self.values(point)[-1]
+
+
+def _layers(network: nn.Module) -> Iterator[nn.Module]:
+    if callable(getattr(network, "collapse", None)):
+        network = network.collapse()  # type: ignore[operator]
+    if network._forward_hooks or network._forward_pre_hooks:
+        raise ConfigError(
+            f"expected layers without forward hooks, received {network}; a hook may change what the layer computes"
+        )
+    if type(network) is nn.Sequential:
+        for part in network:
+            yield from _layers(part)
+    elif list(network.children()):
+        raise ConfigError(
+            f"expected a plain network (nn.Sequential of linear layers and activations), received "
+            f"{type(network).__name__}; pass its layers"
+        )
+    else:
+        yield network
