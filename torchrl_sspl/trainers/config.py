@@ -118,6 +118,8 @@ class SynthesisConfig:
         recovery_coeff: weight of the action that leads back, on latents outside the set.
         guard: barrier value by which every held-out observation of U has to lie outside the set.
         leave_share: largest share of the held-out episodes that may leave the set; none may touch U.
+        return_share: share of the held-out episodes from U that should end in the set; among sets that pass, one that
+            reaches it is preferred to a larger one that does not.
         check_episodes: held-out episodes of a round's check.
         check_horizon: steps of each.
     """
@@ -144,6 +146,7 @@ class SynthesisConfig:
     recovery_coeff: float = 0.3
     guard: float = 0.02
     leave_share: float = 0.00075
+    return_share: float = 0.97
     check_episodes: int = 4000
     check_horizon: int = 40
 

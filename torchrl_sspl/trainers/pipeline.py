@@ -528,11 +528,13 @@ class SafePolicyTraining:
     def _record(self, number: int, agent: Agent, check: Check) -> None:
         self.checks.append(check)
         self._log({"step": number, **{k: v for k, v in vars(check).items() if not isinstance(v, str)}})
-        if check.passed and (self.best is None or check.size >= self.best["size"]):
+        # Of the sets that passed, one into which starts in U return counts first, then the largest.
+        rank = [check.returned >= self.config.synthesis.return_share, check.size]
+        if check.passed and (self.best is None or rank >= self.best["rank"]):
             state = {k: v.clone() for k, v in agent.state_dict().items()}
             state[f"barrier.{len(agent.barrier) - 1}.bias"] -= check.level  # type: ignore[arg-type]
             witness = [m.tolist() for m in self.barrier.multipliers()]
-            self.best = {"size": check.size, "round": number, "agent": state, "multipliers": witness}
+            self.best = {"rank": rank, "round": number, "agent": state, "multipliers": witness}
 
     # ------------------------------------------------------------------ targets
 
