@@ -69,7 +69,6 @@ METRICS: Mapping[str, str] = MappingProxyType(
         "returned": "share of held-out episodes from U that ended inside",
         "size": "share of held-out unlabelled observations with B <= 0",
         "passed": "1 if the round passed its checks",
-        "steps_per_second": "optimiser steps per second since the last row",
         # Evaluation of a frozen agent on fresh episodes of an environment without a known model.
         "eval_unsafe_called_safe": "share of fresh episodes with an observation of U at B <= 0",
         "eval_safe_called_unsafe": "share of fresh episodes with an observation of S at B > 0",
@@ -309,7 +308,7 @@ def close_logger(logger: Any) -> None:
     """
     experiment: Any = getattr(logger, "experiment", None)
     if type(logger).__name__ == "WandbLogger":
-        experiment.finish(quiet=True)
+        experiment.finish()
     elif hasattr(experiment, "close"):
         experiment.close()
     else:
