@@ -99,6 +99,13 @@ def test_integrator_holds_everything():
     assert bool(robust_invariant_set(step, LINE, RIM).inside.all())
 
 
+def test_what_looks_unsafe_within_its_own_error_is_outside_from_the_start():
+    step = LINE[:, None] + torch.tensor([-0.1, 0.0, 0.1])[None, :, None]
+    inside = robust_invariant_set(step, LINE, RIM, residuals=errors(0.05)).inside
+    assert float(LINE[inside].abs().max()) == pytest.approx(0.95, abs=0.006)
+    assert bool(inside[LINE[:, 0].abs() < 0.94].all())
+
+
 def test_integrator_that_cannot_stop_holds_nothing():
     found = robust_invariant_set(DRIFT, LINE, RIM)
     assert not bool(found.inside.any())

@@ -112,10 +112,12 @@ def robust_invariant_set(
 ) -> InvariantSet:
     r"""Largest subset of the candidates that can be kept, whatever the latent error among the given ones.
 
-    .. math:: K_{j+1} = \{ z_i \in K_j : \exists u \; \forall e: \operatorname{nn}(d(z_i, u) + e) \in K_j \}
+    .. math:: K_0 = \{ z_i : \forall e: \operatorname{nn}(z_i + e - \bar e) \notin \text{outside} \}, \qquad
+        K_{j+1} = \{ z_i \in K_j : \exists u \; \forall e: \operatorname{nn}(d(z_i, u) + e) \in K_j \}
 
-    with nn the nearest of all candidates and outside points: the cloud is its own grid. The error e runs over the
-    residuals that were observed near :math:`z_i`: the error of a model from pixels is far from round (a velocity is
+    with nn the nearest of all candidates and outside points: the cloud is its own grid. What looks unsafe within the
+    error of its own encoding is outside from the start. The error e runs over the residuals that were observed near
+    :math:`z_i`, with mean :math:`\bar e`: the error of a model from pixels is far from round (a velocity is
     seen less well than a position), and a ball as large as its longest axis would cost most of the set.
 
     Args:
@@ -154,12 +156,14 @@ def robust_invariant_set(
         raise EmptyRegionError("expected at least one unsafe latent, received 0; label some observations unsafe")
     errors = np.zeros((n, 1, p), np.float32) if residuals is None else residuals.detach().cpu().numpy()
     ends = successors.detach().cpu().numpy()[:, :, None] + errors[:, None]  # (n, k, j, p)
-    nearest = _tree(torch.cat([candidates, outside])).query(ends)[1]
+    tree = _tree(torch.cat([candidates, outside]))
+    nearest = tree.query(ends)[1]
+    seen = candidates.detach().cpu().numpy()[:, None] + errors - errors.mean(1, keepdims=True)
     kept = np.zeros(n, dtype=bool) if absorbing is None else absorbing.detach().cpu().numpy().astype(bool)
     member = np.zeros(n + len(outside), dtype=bool)
-    member[:n] = True
+    member[:n] = (tree.query(seen)[1] < n).all(1) | kept
     possible = np.ones((n, k), dtype=bool)
-    removed = np.zeros(n, dtype=np.int64)
+    removed = np.where(member[:n], 0, 1)
     iteration = 0
     for iteration in range(1, max_iterations + 1):
         # An action that has failed once never comes back: the set only shrinks.
