@@ -1,0 +1,302 @@
+"""Build steps of the site: pages for the API and the gallery, mathematics as MathML, figures in the text.
+
+mkdocs calls the ``on_*`` functions; mkdocstrings loads ``Docstrings``. Everything happens at build time: the pages load
+nothing from elsewhere.
+"""
+
+from __future__ import annotations
+
+import ast
+import html
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+try:
+    import griffe
+    from latex2mathml.converter import convert
+    from mkdocs.structure.files import File
+except ImportError:  # the page generators below need none of them
+    griffe = None
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "torchrl_sspl"
+SECTIONS = {  # in the order of the floors, from the mathematics to the tools
+    "functional": "Equations",
+    "sets": "Regions",
+    "errors": "Errors",
+    "lipschitz": "Lipschitz bounds",
+    "modules": "Networks",
+    "envs": "Environments",
+    "certification": "Certification",
+    "data": "Data",
+    "objectives": "Losses",
+    "safety": "Run-time safety",
+    "trainers": "Training",
+    "viz": "Figures and reports",
+    "cli": "Command line",
+}
+log = logging.getLogger("mkdocs.hooks.sspl")
+
+
+# ---------------------------------------------------------------- API pages
+
+
+def parts() -> list[str]:
+    """Public modules and packages directly below the library, in reading order."""
+    found = {p.stem for p in (ROOT / PACKAGE).iterdir() if p.suffix == ".py" or (p / "__init__.py").exists()}
+    found = {name for name in found if not name.startswith("_")}
+    return [n for n in SECTIONS if n in found] + sorted(found - set(SECTIONS))
+
+
+def definitions(path: Path) -> list[str]:
+    """Public functions and classes that a file defines at its top level."""
+    body = ast.parse(path.read_text()).body
+    kinds = (ast.FunctionDef, ast.ClassDef)
+    return [node.name for node in body if isinstance(node, kinds) and not node.name.startswith("_")]
+
+
+def exported(path: Path) -> list[str]:
+    """The names in a package's ``__all__``."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "__all__":
+            return [name for name in ast.literal_eval(node.value)]
+    return []
+
+
+def documented(part: str) -> list[str]:
+    """Dotted names that the page of a part shows: what the package exports, then what else its modules define."""
+    root = ROOT / PACKAGE / part
+    if not root.is_dir():
+        return [f"{PACKAGE}.{part}.{name}" for name in definitions(root.with_suffix(".py"))]
+    public = exported(root / "__init__.py")
+    names = [f"{PACKAGE}.{part}.{name}" for name in public]
+    for path in sorted(root.rglob("*.py")):
+        inner = path.relative_to(root).with_suffix("").parts
+        if any(piece.startswith("_") for piece in inner):
+            continue
+        module = ".".join((PACKAGE, part, *inner))
+        names += [f"{module}.{name}" for name in definitions(path) if name not in public]
+    return names
+
+
+def assigned(path: Path, name: str) -> Any:
+    """Value of a literal that a file assigns at its top level."""
+    for node in ast.parse(path.read_text()).body:
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == name:
+            return ast.literal_eval(node.value)
+    raise ValueError(f"expected a literal '{name}' in {path.name}, found none")
+
+
+def top_level() -> dict[str, str]:
+    """Names of ``import torchrl_sspl`` and where each is documented."""
+    places = {}
+    for name, module in assigned(ROOT / PACKAGE / "__init__.py", "_NAMES").items():
+        part = module.split(".")[0]
+        short = f"{PACKAGE}.{part}.{name}"
+        places[name] = short if short in documented(part) else f"{PACKAGE}.{module}.{name}"
+    return places
+
+
+def anchor(name: str) -> str:
+    return f'<a id="{PACKAGE}.{name}"></a>'
+
+
+def api_index() -> str:
+    """The names of ``import torchrl_sspl`` on one page."""
+    lines = ["# API", "", "`import torchrl_sspl as sspl` is light: every name is loaded when it is first used.", ""]
+    lines += ["| Name | |", "|---|---|"]
+    for name, target in sorted(top_level().items(), key=lambda item: item[0].lower()):
+        lines.append(f"| {anchor(name)}[`sspl.{name}`][{target}] | {summary(target)} |")
+    for part in parts():
+        words, title = f"`sspl.{part}`", SECTIONS.get(part, part)
+        link = f"[{words}]({part}.md)" if documented(part) else words
+        lines.append(f"| {anchor(part)}{link} | {title} |")
+    return "\n".join([*lines, f"| {anchor('__version__')}`sspl.__version__` | version of the library |", ""])
+
+
+def summary(dotted: str) -> str:
+    """First sentence of the docstring of a function or class."""
+    part, *_, name = dotted.split(".")[1:]
+    root = ROOT / PACKAGE / part
+    for path in sorted(root.rglob("*.py")) if root.is_dir() else [root.with_suffix(".py")]:
+        for node in ast.parse(path.read_text()).body:
+            if getattr(node, "name", None) == name and isinstance(node, ast.FunctionDef | ast.ClassDef):
+                first = " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split())
+                return to_markdown(re.split(r"\.(?: |$)", first)[0]).replace("|", "\\|")
+    return ""
+
+
+def api_page(part: str) -> str:
+    root = ROOT / PACKAGE / part
+    source = root / "__init__.py" if root.is_dir() else root.with_suffix(".py")
+    intro = ast.get_docstring(ast.parse(source.read_text())) or ""
+    names = documented(part)
+    title = SECTIONS.get(part, part)
+    lines = [f"# {title}", "", f"`{PACKAGE}.{part}`", "", to_markdown(intro.split("\n\n")[0]), ""]
+    if len(names) > 4:
+        lines += [" · ".join(f"[`{name.rsplit('.', 1)[1]}`][{name}]" for name in names), ""]
+    for name in names:
+        lines += [f"::: {name}", ""]
+    return "\n".join(lines)
+
+
+# ------------------------------------------------------------------ gallery
+
+
+def examples() -> list[Path]:
+    return sorted((ROOT / "examples").glob("[!_]*.py"))
+
+
+def gallery_title(path: Path) -> str:
+    first = (ast.get_docstring(ast.parse(path.read_text())) or path.stem).split("\n")[0]
+    return re.split(r"[:.](?:\s|$)", first)[0]
+
+
+def gallery_images(path: Path) -> list[Path]:
+    """Pictures of an example: docs/images/<example>*.png, or those named in docs/images/<example>.txt order."""
+    return sorted((ROOT / "docs" / "images").glob(f"{path.stem}*.png"))
+
+
+def gallery_page(path: Path) -> str:
+    source = path.read_text()
+    doc = ast.get_docstring(ast.parse(source)) or ""
+    blocks = doc.split("\n\n")
+    text = "\n\n".join(blocks[1:] if len(blocks) > 1 else [])
+    lines = [f"# {gallery_title(path)}", "", to_markdown(blocks[0]), "", to_markdown(text), ""]
+    for image in gallery_images(path):
+        caption = image.with_suffix(".txt")
+        words = " ".join(caption.read_text().split()) if caption.exists() else gallery_title(path)
+        lines += [f"![{words}](../images/{image.name})", "", f"*{words}*", ""]
+    body = source[source.index('"""', 3) + 3 :].lstrip("\n") if source.startswith(('"""', 'r"""')) else source
+    lines += [f"`examples/{path.name}`", "", "```python", body.rstrip(), "```", ""]
+    return "\n".join(lines)
+
+
+def gallery_index() -> str:
+    lines = ["# Gallery", "", "Every example is run by the tests. Start one with `python examples/<name>.py`.", ""]
+    lines += ["| Example | |", "|---|---|"]
+    for path in examples():
+        pictures = gallery_images(path)
+        shown = f"[![{gallery_title(path)}](../images/{pictures[0].name}){{ width=160 }}]({path.stem}.md)" if pictures else ""
+        lines.append(f"| [{gallery_title(path)}]({path.stem}.md)<br>`examples/{path.name}` | {shown} |")
+    return "\n".join([*lines, ""])
+
+
+# ------------------------------------------------- reStructuredText to Markdown
+
+ROLE = re.compile(r":(?:py:)?(?:class|func|meth|mod|attr|data|obj):`~?([^`]+)`")
+MATH = re.compile(r":math:`((?:[^`])+)`", re.DOTALL)
+BLOCK = re.compile(r"^(?P<indent>[ ]*)\.\. math::(?P<first>[^\n]*)\n(?P<rest>(?:(?P=indent)[ ]+[^\n]*\n|[ ]*\n)*)", re.MULTILINE)
+
+
+def to_markdown(text: str) -> str:
+    r"""Docstrings are written for ``help()`` with the roles of Sphinx; this turns them into Markdown.
+
+    Example:
+        >>> to_markdown(r":math:`\psi` of :class:`LatentLoss` is ``float``")
+        '\\(\\psi\\) of `LatentLoss` is `float`'
+    """
+
+    def block(match: re.Match[str]) -> str:
+        body = "\n".join([match["first"], *match["rest"].split("\n")])
+        formula = " ".join(body.split())
+        if "&" in formula and r"\begin" not in formula:
+            formula = rf"\begin{{aligned}} {formula} \end{{aligned}}"
+        indent = match["indent"]
+        return f"\n{indent}$$\n{indent}{formula}\n{indent}$$\n\n"
+
+    text = BLOCK.sub(block, text + "\n")
+    text = MATH.sub(lambda match: rf"\({' '.join(match[1].split())}\)", text)
+    text = ROLE.sub(lambda match: f"`{match[1].rsplit('.', 1)[-1]}`", text)
+    return re.sub(r"``([^`]+)``", r"`\1`", text).rstrip("\n")
+
+
+if griffe is not None:
+
+    class Docstrings(griffe.Extension):
+        """Rewrites every docstring before it is parsed."""
+
+        def on_object(self, *, obj: Any, **_: Any) -> None:
+            self.rewrite(obj)
+
+        on_instance = on_object
+
+        def rewrite(self, obj: Any) -> None:
+            if obj.is_alias or obj.docstring is None or getattr(obj.docstring, "_markdown", False):
+                return
+            text = to_markdown(obj.docstring.value)
+            text = re.sub(r"^( *)Example:$", r"\1Examples:", text, flags=re.MULTILINE)
+            text = re.sub(r"^( *)Source: ", r"\1**Source:** ", text, flags=re.MULTILINE)
+            obj.docstring.value = text
+
+
+# ------------------------------------------------------------------- mkdocs
+
+
+def on_config(config: Any) -> Any:
+    """Fills in the generated parts of the navigation."""
+    docs = Path(config["docs_dir"])
+
+    def fill(item: Any) -> Any:
+        if isinstance(item, list):
+            return [done for done in map(fill, item) if done]
+        title, value = next(iter(item.items()))
+        if value == "gallery/":
+            value = ["gallery/index.md", *({gallery_title(p): f"gallery/{p.stem}.md"} for p in examples())]
+        elif value == "api/":
+            value = ["api/index.md", *({SECTIONS.get(p, p): f"api/{p}.md"} for p in parts() if documented(p))]
+        elif isinstance(value, list):
+            value = fill(value)
+        elif not (docs / value).exists():
+            log.info("no page %s yet", value)
+            return None
+        return {title: value}
+
+    config["nav"] = fill(config["nav"])
+    return config
+
+
+def on_files(files: Any, config: Any) -> Any:
+    pages = {"gallery/index.md": gallery_index(), "api/index.md": api_index()}
+    pages |= {f"gallery/{path.stem}.md": gallery_page(path) for path in examples()}
+    pages |= {f"api/{part}.md": api_page(part) for part in parts() if documented(part)}
+    for place, content in pages.items():
+        files.append(File.generated(config, place, content=content))
+    return files
+
+
+def readme_section(title: str) -> str:
+    """A section of the README, with its links as seen from docs/."""
+    found = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
+    if found is None:
+        raise ValueError(f"expected a section '{title}' in README.md, found none: rename it in the page that includes it")
+    text = re.sub(r"\]\(docs/", "](", found[1])
+    return re.sub(r"\]\(examples/(\w+)\.py\)", r"](gallery/\1.md)", text).strip()
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    return re.sub(r"<!-- README: (.*?) -->", lambda match: readme_section(match[1]), markdown)
+
+
+INLINE = re.compile(r'<span class="arithmatex">\\\((.*?)\\\)</span>', re.DOTALL)
+DISPLAY = re.compile(r'<div class="arithmatex">\s*\\\[(.*?)\\\]\s*</div>', re.DOTALL)
+FIGURE = re.compile(r'<p><img alt="(?P<alt>[^"]*)" src="[^"]*images/(?P<name>[\w-]+\.svg)" ?/?></p>')
+
+
+def formula(latex: str, display: str) -> str:
+    return str(convert(html.unescape(latex).strip(), display=display))
+
+
+def draw(match: re.Match[str]) -> str:
+    """A figure inside the page takes the colours of the page."""
+    svg = (ROOT / "docs" / "images" / match["name"]).read_text()
+    svg = re.sub(r"<\?xml.*?\?>\s*", "", svg)
+    return f'<figure class="diagram" role="img" aria-label="{match["alt"]}">{svg}</figure>'
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    content = FIGURE.sub(draw, content)
+    content = INLINE.sub(lambda match: formula(match[1], "inline"), content)
+    return DISPLAY.sub(lambda match: f'<div class="formula">{formula(match[1], "block")}</div>', content)
