@@ -227,9 +227,9 @@ def test_wrong_shapes_and_unknown_layers_are_refused():
         graph.network(1, nn.Linear(3, 1))
     with pytest.raises(ConfigError, match="GELU"):
         graph.network(0, nn.Sequential(nn.Linear(2, 2), nn.GELU()))
+    layer = nn.Linear(2, 2)
+    layer.register_forward_hook(lambda *_: None)
     with pytest.raises(ConfigError, match="hooks"):
-        layer = nn.Linear(2, 2)
-        layer.register_forward_hook(lambda *_: None)
         graph.network(0, nn.Sequential(layer))
     with pytest.raises(ConfigError, match="boxes"):
         Budget(boxes=-1)

@@ -10,9 +10,28 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from torchrl_sspl.certification.certificate import MEASURED, PROVED, Certificate, Layer, Reason, Statement
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.viz import format_value, requirement_rows, write_report
+from torchrl_sspl.viz.certificate import certificate_section, proved_lines
 from torchrl_sspl.viz.plane import new_figure
+
+CERTIFICATE = Certificate(
+    "demo",
+    "ab" * 32,
+    "cd" * 32,
+    -0.1,
+    {
+        "deterministic": Layer(
+            "deterministic",
+            [
+                Statement("a", "kept <always>", PROVED, True),
+                Statement("b", "tolerates", PROVED, False, 0.1, "latent", reason=Reason.MARGIN_TOO_SMALL.name, misses_by=0.25),
+            ],
+        ),
+        "statistical": Layer("statistical", [Statement("c", "left", MEASURED, True, 0.001, "share", 2000, 0.95)]),
+    },
+)
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 
@@ -81,7 +100,7 @@ def full(tmp_path, **more):
         figures={"Plane": figure, "Saved": (tmp_path / "saved.png", "From a file.")},
         config={"seed": 7, "preset": "sound", "network": {"latent_dim": 3}},
         checks=[{"round": 0, "size": 0.25, "passed": True, "reason": ""}],
-        certificate_html='<p onclick="x()">certificate</p><script src="https://example.org/x.js"></script>',
+        certificate=certificate_section(CERTIFICATE),
         video=tmp_path / "film.mp4",
         notes="First.\n\nSecond <script>alert(1)</script>.",
         proved=["B is 2-Lipschitz."],
@@ -170,10 +189,11 @@ def test_everything_is_escaped(tmp_path, where):
     assert "&lt;script&gt;" in text
 
 
-def test_certificate_stays_in_a_frame_without_scripts(tmp_path):
-    parsed, text = full(tmp_path)
-    assert parsed.tags.count("iframe") == 1
-    assert '<iframe sandbox title="Certificate" srcdoc="&lt;p onclick=' in text
+def test_certificate_says_what_is_proved_measured_and_not_certified(tmp_path):
+    _, text = full(tmp_path)
+    for words in ("What the weights prove", "kept &lt;always&gt;", "not proved, misses by 0.25 latent", "2,000, 95 %"):
+        assert words in text
+    assert proved_lines(CERTIFICATE) == ["kept <always>."]
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ class NetworkConfig:
         policy_hidden: widths of the policy's hidden layers.
         pool_to: frames are averaged to this height and width before the first convolution (pixels).
         velocity_gain: factor on the difference of the two frames' features.
+        encoder: "FrameEncoder" (convolutions) or "MomentEncoder" (centres of colours before a background).
     """
 
     latent_dim: int = 3
@@ -37,6 +38,7 @@ class NetworkConfig:
     policy_hidden: list[int] = field(default_factory=lambda: [48, 48])
     pool_to: int = 32
     velocity_gain: float = 4.0
+    encoder: str = "FrameEncoder"
 
 
 @dataclass
@@ -160,6 +162,7 @@ class EvaluationConfig:
         kernel_grid: states per dimension of the grid on which the true kernel is computed.
         rollouts: episodes started in the safe set, and as many in S and U (a fifth each).
         horizon: steps per episode.
+        certificate_episodes: fresh episodes, and fresh observations of U, behind the certificate's statistical layer.
         gymnasium_rollouts: episodes on gymnasium's own frames (0: not evaluated).
         seed: seed of the evaluation's own random numbers.
     """
@@ -168,6 +171,7 @@ class EvaluationConfig:
     kernel_grid: int = 301
     rollouts: int = 10000
     horizon: int = 200
+    certificate_episodes: int = 3000
     gymnasium_rollouts: int = 1000
     seed: int = 20260101
 
@@ -295,7 +299,7 @@ def _apply_preset(config: TrainingConfig) -> None:
             check_episodes=40,
             check_horizon=5,
         )
-        config.evaluation = EvaluationConfig(grid=21, kernel_grid=101, rollouts=40, horizon=20, gymnasium_rollouts=0)
+        config.evaluation = EvaluationConfig(grid=21, kernel_grid=101, rollouts=40, horizon=20, certificate_episodes=60, gymnasium_rollouts=0)
 
 
 def _flatten(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:

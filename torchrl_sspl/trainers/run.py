@@ -11,10 +11,12 @@ from typing import Any
 import torch
 from tqdm import tqdm
 
+from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.certification.ground_truth import viability_kernel
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import MissingDependencyError
 from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, certify
 from torchrl_sspl.trainers.config import EvaluationConfig, TrainingConfig
 from torchrl_sspl.trainers.evaluation import Draw, Evaluation, evaluate
 from torchrl_sspl.trainers.paper import PaperTraining
@@ -34,6 +36,7 @@ class RunOutcome:
         training: the training's result.
         evaluation: measurements on the environment's own frames.
         foreign: measurements on frames of another renderer, or None.
+        certificate: what is proved, measured and assumed about the agent.
         requirements: table that the evaluation is judged by.
         report: the page, or None where matplotlib is missing.
     """
@@ -42,6 +45,7 @@ class RunOutcome:
     training: TrainingResult
     evaluation: Evaluation
     foreign: Evaluation | None
+    certificate: Certificate
     requirements: Sequence[Requirement]
     report: Path | None
 
@@ -65,6 +69,7 @@ class RunOutcome:
         rows = self.rows()
         width = max(len(r[0]) for r in rows)
         lines = [f"{label:<{width}}  {value:<38} must {must:<9} {verdict}" for label, value, must, _, verdict in rows]
+        lines += [f"certificate, {layer.name} layer: {layer.verdict}" for layer in self.certificate.layers.values()]
         return "\n".join([*lines, f"training: {self.training.seconds:.0f} s; {self.training.stop_reason}"])
 
 
@@ -109,21 +114,31 @@ def run(
         action: name and unit of the action.
 
     Returns:
-        The outcome; ``metrics.json``, ``figures/``, ``report.html`` and ``agent/`` are on disk.
+        The outcome; ``metrics.json``, ``figures/``, ``report.html`` and ``agent/`` (with ``certificate.json``) are on disk.
 
     Source: none.
     """
     directory = Path(config.out_dir)
     training = train(config, make_env)
-    own, other = assess(training.agent, make_env([1], config.seed), config.evaluation, foreign, progress=config.progress)
-    outcome = RunOutcome(directory, training, own, other, requirements, None)
+    env = make_env([1], config.seed)
+    own, other = assess(training.agent, env, config.evaluation, foreign, progress=config.progress)
+    certificate = certify(
+        training.agent,
+        env,
+        name=directory.name,
+        episodes=config.evaluation.certificate_episodes,
+        horizon=config.evaluation.horizon,
+        progress=config.progress,
+    )
+    certificate.save(directory / "agent" / CERTIFICATE_FILE)
+    outcome = RunOutcome(directory, training, own, other, certificate, requirements, None)
     write_metrics(outcome, config)
     try:
         from torchrl_sspl.viz.run import write_run_report
     except MissingDependencyError as error:
         tqdm.write(f"no figures and no report: {error}")
         return outcome
-    outcome.report = write_run_report(outcome, config, make_env([1], config.seed), title=title, axes=axes, action=action)
+    outcome.report = write_run_report(outcome, config, env, title=title, axes=axes, action=action)
     return outcome
 
 

@@ -102,8 +102,23 @@ def _count(value: Any) -> str:
     return "\u2013" if value is None else format_value(value)
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
-    """Table of cells that are HTML already; every cell knows its column, so that a phone can stack them."""
+def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
+    """A table of cells that are HTML already; every cell knows its column, so that a phone can stack them.
+
+    Args:
+        head: titles of the columns, plain text.
+        rows: cells, HTML.
+        kind: class of the table.
+
+    Returns:
+        HTML.
+
+    Source: none.
+
+    Example:
+        >>> "<td data-label=\"a\">1</td>" in table(["a"], [["1"]])
+        True
+    """
     top = "".join(f'<th scope="col">{escape(h)}</th>' for h in head)
     body = "".join(
         "<tr>" + "".join(f'<td data-label="{escape(h)}">{c}</td>' for h, c in zip(head, row, strict=True)) + "</tr>"
@@ -126,7 +141,21 @@ _BADGES = {"good": "\u2713", "fair": "\u2713", "bad": "\u2717", "none": "?"}
 _WORDS = {"aim": "aim reached", "must": "must reached"}
 
 
-def _badge(verdict: str) -> str:
+def badge(verdict: str) -> str:
+    """A verdict as a coloured mark.
+
+    Args:
+        verdict: begins with "aim", "proved", "yes", "pass" (good), "must" (fair), "not measured", or anything else (bad).
+
+    Returns:
+        HTML.
+
+    Source: none.
+
+    Example:
+        >>> "good" in badge("proved"), "bad" in badge("missed by 2")
+        (True, True)
+    """
     kind = _verdict_kind(verdict)
     text = _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or NOT_MEASURED)
     return f'<span class="badge {kind}">{_BADGES[kind]}&nbsp;{escape(text)}</span>'
@@ -180,7 +209,7 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
                 escape(_count(m.get("n"))),
                 escape(format_value(must)),
                 escape(format_value(aim)),
-                _badge(verdict),
+                badge(verdict),
             ]
         )
     reached, missed, unknown = (sum(k in group for k in kinds) for group in (("good", "fair"), ("bad",), ("none",)))
@@ -196,7 +225,7 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
     if reached:
         headline += f", {aims} at the aim" if not missed else f", {reached} reached"
     head = ("Requirement", "Measured", "95 % bound", "n", "Must", "Aim", "Verdict")
-    return headline, kind, _table(head, out, kind="summary") if rows else ""
+    return headline, kind, table(head, out, kind="summary") if rows else ""
 
 
 def _data_uri(data: bytes, mime: str) -> str:
@@ -278,7 +307,7 @@ def _sizes(checks: Sequence[Any]) -> str:
     names = list(dict.fromkeys(k for row in rows for k in row))
     share = ("size", "returned")
     cells = [[escape(format_value(r.get(k), "share" if k in share else "")) for k in names] for r in rows]
-    return _table([n.replace("_", " ") for n in names], cells, kind="plain")
+    return table([n.replace("_", " ") for n in names], cells, kind="plain")
 
 
 def write_report(
@@ -290,7 +319,7 @@ def write_report(
     figures: Mapping[str, Any] | None = None,
     config: Mapping[str, Any] | None = None,
     checks: Sequence[Any] = (),
-    certificate_html: str | None = None,
+    certificate: str | None = None,
     video: str | Path | None = None,
     notes: str = "",
     proved: Sequence[str] = (),
@@ -311,7 +340,7 @@ def write_report(
         figures: by name: a matplotlib Figure (its label is the caption), the path of a picture, or (either, caption).
         config: everything that determined the run, nested; its ``seed`` is named at the top.
         checks: held-out checks, one mapping or dataclass per round.
-        certificate_html: a certificate's own page or fragment, shown in a frame that may run no scripts.
+        certificate: section made by :func:`~torchrl_sspl.viz.certificate.certificate_section`.
         video: mp4, webm or gif file.
         notes: text, in paragraphs separated by empty lines.
         proved: statements that are proved. Never derived from the measurements: pass what a proof has returned.
@@ -335,7 +364,7 @@ def write_report(
     """
     data = {name: _plain(f"measurements[{name!r}]", m) for name, m in (measurements or {}).items()}
     config = dict(config or {})
-    headline, kind, table = _summary(summary, data)
+    headline, kind, rows_of_summary = _summary(summary, data)
     measured = _measured_lines(summary, data)
     columns = [
         ("Proved", list(proved) or ["Nothing is claimed as proved."]),
@@ -356,8 +385,10 @@ def write_report(
         + "".join(f"<div><h3>{name}</h3>{_list(items)}</div>" for name, items in columns)
         + "</div></section>",
     ]
-    if table:
-        parts.append(f"<section><h2>Requirements</h2>{table}</section>")
+    if rows_of_summary:
+        parts.append(f"<section><h2>Requirements</h2>{rows_of_summary}</section>")
+    if certificate:
+        parts.append(certificate)
     if notes.strip():
         paragraphs = (escape(p.strip()).replace("\n", "<br>") for p in re.split(r"\n\s*\n", notes.strip()))
         parts.append("<section><h2>Notes</h2>" + "".join(f"<p>{p}</p>" for p in paragraphs) + "</section>")
@@ -369,11 +400,6 @@ def write_report(
         )
     if figures:
         parts.append("<section><h2>Figures</h2>" + "".join(_figure(n, f) for n, f in figures.items()) + "</section>")
-    if certificate_html:
-        parts.append(
-            "<section><h2>Certificate</h2>"
-            f'<iframe sandbox title="Certificate" srcdoc="{escape(certificate_html)}"></iframe></section>'
-        )
     if checks:
         parts.append(f"<section><h2>Held-out checks of every round</h2>{_sizes(checks)}</section>")
     if data:
@@ -387,13 +413,13 @@ def write_report(
             ]
             for n, m in data.items()
         ]
-        body = _table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
+        body = table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
         parts.append(
             f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>"
         )
     if config:
         rows = [[f"<code>{escape(k)}</code>", escape(str(v))] for k, v in _flatten(config)]
-        body = _table(("Key", "Value"), rows, kind="plain")
+        body = table(("Key", "Value"), rows, kind="plain")
         parts.append(f"<section><details><summary>Configuration</summary>{body}</details></section>")
 
     page = (

@@ -28,7 +28,6 @@ code{font-size:.88em;overflow-wrap:anywhere}
 figure{margin:0 0 22px}figure:last-child{margin-bottom:0}
 img,video{display:block;max-width:100%;height:auto;margin:0 auto;background:#fff;border-radius:8px}
 figcaption{color:var(--soft);font-size:.9rem;margin-top:.4rem}figcaption b{color:var(--ink)}
-iframe{width:100%;height:min(70vh,640px);border:1px solid var(--line);border-radius:8px;background:#fff;color-scheme:light}
 summary{font-size:1.2rem;font-weight:700;cursor:pointer}details[open] summary{margin-bottom:.6rem}
 @media(max-width:760px){main{padding:14px 8px 40px}section{padding:14px 12px}.columns{grid-template-columns:1fr;gap:12px}
 table.summary thead{display:none}table.summary tr{display:block;padding:.5em 0;border-bottom:1px solid var(--line)}

@@ -9,6 +9,7 @@ import torch
 
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.viz.animation import animate
+from torchrl_sspl.viz.certificate import certificate_section, proved_lines
 from torchrl_sspl.viz.figures import frames, latent_space, state_plane, training_curves, trajectories
 from torchrl_sspl.viz.plane import Plane
 from torchrl_sspl.viz.report import requirement_rows, write_report
@@ -105,18 +106,7 @@ def write_run_report(
             for row in requirement_rows(outcome.requirements, outcome.foreign)
         ]
         measurements |= {f"foreign frames: {k}": v for k, v in outcome.foreign.measurements.items()}
-    proof = agent.description.get("lipschitz", {})
-    bound = f"The deployed float32 barrier is {agent.lipschitz_bound:g}-Lipschitz on all of its domain"
-    proved = [f"{bound} (exact integer arithmetic)."] if proof.get("proved") else []
     notes = [f"Training took {outcome.training.seconds:.0f} s. Why it ended: {outcome.training.stop_reason}."]
-    if not proof.get("proved"):
-        notes.append(
-            f"Not proved: {bound[0].lower() + bound[1:]}; {proof.get('reason', 'no proof was tried')}."
-        )
-    notes.append(
-        "Invariance of {B <= 0} is measured, not proved: the share of episodes that leave it carries a 95 % bound, and no "
-        "statement is made about single states."
-    )
     return write_report(
         directory / "report.html",
         title=title,
@@ -127,5 +117,6 @@ def write_run_report(
         checks=outcome.training.checks,
         video=video,
         notes="\n\n".join(notes),
-        proved=proved,
+        proved=proved_lines(outcome.certificate),
+        certificate=certificate_section(outcome.certificate),
     )

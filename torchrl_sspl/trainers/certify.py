@@ -1,0 +1,227 @@
+"""Certificates of trained agents: issue one, and check one again from the weights."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.certification.branch_and_bound import Budget
+from torchrl_sspl.certification.certificate import (
+    Certificate,
+    Layer,
+    Reason,
+    configuration_digest,
+    differences,
+    weights_digest,
+)
+from torchrl_sspl.certification.conditions import closed_loop_lipschitz
+from torchrl_sspl.certification.layers import (
+    Sample,
+    deterministic_layer,
+    fingerprint,
+    level_that_holds,
+    paper_layer,
+    statistical_layer,
+)
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import CertificationError, ConfigError
+from torchrl_sspl.functional import covering_radius
+from torchrl_sspl.modules.agent import Agent, agent_directory
+from torchrl_sspl.trainers.evaluation import encode_states, rollout
+
+CERTIFICATE_FILE = "certificate.json"
+#: What a certificate is about; everything else in the description (the certificate's own traces, notes) may change.
+_CERTIFIED_KEYS = ("networks", "training", "lipschitz")
+
+
+def certify(
+    agent: Agent,
+    env: SafetyEnv | None,
+    *,
+    name: str = "agent",
+    level: float | None = None,
+    episodes: int = 3000,
+    horizon: int = 200,
+    seed: int = 20260707,
+    budget: Budget | None = None,
+    progress: bool = False,
+) -> Certificate:
+    r"""Certifies a frozen agent: the set {B <= s} with the largest s <= 0 that is proved to be kept.
+
+    Args:
+        agent: frozen agent.
+        env: the true system, for the layers that are measured; without one, only what the weights prove.
+        name: name of the agent.
+        level: s, barrier units; searched for if not given.
+        episodes: number of fresh episodes from the set, and of fresh observations of U.
+        horizon: steps per episode.
+        seed: seed of the fresh data; must not have been used for anything else.
+        budget: of each search of the deterministic layer.
+        progress: show progress bars.
+
+    Returns:
+        The certificate.
+
+    Source: paper Theorem 1; deviation: proved on the whole latent domain, and measured on fresh episodes.
+
+    Example:
+        >>> from torchrl_sspl.modules.agent import load
+        >>> certify(load("pendulum"), None, name="pendulum").layers["deterministic"].holds
+        True
+    """
+    budget = budget or Budget(seconds=300.0)
+    parts = (agent.barrier, agent.dynamics, agent.policy)
+    bound, p = agent.lipschitz_bound, agent.latent_dim
+    if level is None:
+        level = level_that_holds(*parts, latent_dim=p, lipschitz_bound=bound, budget=budget)
+    witness = agent.description.get("lipschitz", {}).get("multipliers")
+    proof = deterministic_layer(
+        *parts,
+        latent_dim=p,
+        lipschitz_bound=bound,
+        level=level,
+        multipliers=None if witness is None else [torch.tensor(m) for m in witness],
+        budget=budget,
+    )
+    certified = {k: agent.description.get(k) for k in _CERTIFIED_KEYS} | {"lipschitz_bound": bound}
+    certificate = Certificate(
+        name, weights_digest(agent.state_dict()), configuration_digest(certified), level, {"deterministic": proof}
+    )
+    if env is not None:
+        tolerated = next((s.value for s in proof.statements if s.name == "tolerated error"), None)
+        sample, conditions = _measure(agent, env, level, episodes, horizon, seed, progress)
+        certificate.layers["statistical"] = statistical_layer(sample, level=level, tolerated_error=tolerated)
+        certificate.layers["paper"] = conditions
+    return certificate
+
+
+@torch.no_grad()
+def _measure(
+    agent: Agent, env: SafetyEnv, level: float, episodes: int, horizon: int, seed: int, progress: bool
+) -> tuple[Sample, Layer]:
+    """Fresh episodes and observations, and the paper's conditions on them."""
+    generator = torch.Generator().manual_seed(seed)
+    training = agent.description.get("training", {})
+    used = [training.get("seed", -1), training.get("evaluation", {}).get("seed", -1)]
+
+    def draw(n: int, keep: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
+        """Uniform states for whose latents a condition holds, and these latents."""
+        states, latents, count = [], [], 0
+        for _ in range(60):
+            state = env.state_space.sample(2 * n, generator=generator)
+            latent = encode_states(agent, env, state)
+            kept = keep(latent)
+            states.append(state[kept])
+            latents.append(latent[kept])
+            count += int(kept.sum())
+            if count >= n:
+                break
+        return torch.cat(states)[:n], torch.cat(latents)[:n]
+
+    start, inside = draw(episodes, lambda z: agent.barrier(z)[:, 0] <= level)
+    unsafe_state = env.unsafe_set.sample(episodes, generator=generator)
+    safe_state = env.safe_set.sample(episodes, generator=generator)
+    unsafe_latent = encode_states(agent, env, unsafe_state)
+    safe_latent = encode_states(agent, env, safe_state)
+    unsafe, safe = (agent.barrier(z)[:, 0] for z in (unsafe_latent, safe_latent))
+    if len(start):
+        run = rollout(agent, env, start, horizon, progress=progress, label="fresh episodes")
+        error, barrier = run.prediction_error, run.barrier
+    else:
+        error, barrier = torch.zeros(1, 0), torch.zeros(2, 0)
+    rims = []
+    before = barrier[:-1]
+    for name, lower, upper in (
+        ("deep in the set", -math.inf, level - 0.3),
+        ("half way", level - 0.3, level - 0.1),
+        ("at the rim", level - 0.1, level),
+    ):
+        here = error[(before > lower) & (before <= upper)].sort().values
+        if len(here):
+            rank = min(len(here) - 1, math.ceil(0.999 * len(here)) - 1)
+            rims.append((name, len(here), float(here[rank]), float(here[-1])))
+    latent = torch.cat([inside, unsafe_latent, safe_latent])
+    sample = Sample(
+        error.amax(0) if error.shape[1] else torch.zeros(0),
+        (barrier > level).any(0),
+        unsafe,
+        latent,
+        horizon,
+        seed,
+        used_seeds=used,
+        fingerprints=fingerprint(torch.cat([start, unsafe_state, safe_state])),
+        rims=rims,
+    )
+    reference = encode_states(agent, env, env.sample_states(4 * episodes, generator=generator))
+    following = agent.barrier(agent.dynamics(inside, agent.policy(inside)))[:, 0]
+    try:
+        constant = closed_loop_lipschitz(agent.dynamics, agent.policy)
+    except ConfigError:
+        constant = math.inf
+    conditions = paper_layer(
+        safe=safe,
+        unsafe=unsafe,
+        following=following,
+        lipschitz_bound=agent.lipschitz_bound,
+        covering_radius=covering_radius(latent, reference),
+        dynamics_error=float(error.max()) if error.numel() else math.nan,
+        closed_loop_constant=constant,
+    )
+    return sample, conditions
+
+
+def verify_run(name: str | Path, *, env: SafetyEnv | None = None, report: Callable[[str], None] = print) -> int:
+    """Checks a certificate again: hashes, and everything that the weights prove.
+
+    Args:
+        name: name of a shipped agent, a run directory or the directory of an agent.
+        env: the true system, to measure the statistical layer again with the same seed too.
+        report: called with every line that a person should read.
+
+    Returns:
+        0 if everything was found again, 1 if not; the reasons are reported.
+
+    Raises:
+        CertificationError: if there is no certificate.
+        CheckpointError: if the agent cannot be read.
+
+    Source: none.
+
+    Example:
+        >>> verify_run("pendulum", report=lambda line: None)
+        0
+    """
+    directory = agent_directory(name)
+    if not (directory / CERTIFICATE_FILE).is_file():
+        raise CertificationError(
+            f"expected {CERTIFICATE_FILE} beside the agent in '{directory}', found none; certify(agent, env) issues one"
+        )
+    try:
+        claimed = Certificate.load(directory / CERTIFICATE_FILE)
+    except CertificationError as error:
+        report(f"FAILED {Reason.SCHEMA_UNKNOWN.name}: {error}")
+        return 1
+    again = certify(Agent.load(directory), env, name=claimed.agent, level=claimed.level)
+    layers = ["deterministic"] + (["statistical", "paper"] if env is not None else [])
+    found = differences(claimed, again, layers=layers)
+    for reason, detail in found.items():
+        report(f"FAILED {reason.name}: {reason.value} ({detail})")
+    if found:
+        return 1
+    for layer in claimed.layers.values():
+        checked = "checked again" if layer.name in layers else "not checked again"
+        report(f"{layer.name:14s} {checked}: {layer.verdict}")
+        for s in layer.statements:
+            value = "" if s.value is None else f" {s.value:.4g} {s.unit}"
+            sample = (
+                ""
+                if s.n is None
+                else f" (n = {s.n:,}" + (")" if s.confidence is None else f", {100 * s.confidence:g} %)")
+            )
+            report(f"    {s.kind:9s} {s.text}{value}{sample}" + (f" [{s.detail}]" if s.detail else ""))
+    report(f"OK: the weights are {claimed.weights[:12]}..., and prove what the certificate of '{claimed.agent}' says")
+    return 0

@@ -1,0 +1,83 @@
+"""A certificate as a part of the report: in ten seconds, what is guaranteed and what is not."""
+
+from __future__ import annotations
+
+from html import escape
+
+from torchrl_sspl.certification.certificate import ASSUMED, PROVED, Certificate, Statement
+from torchrl_sspl.viz.report import badge, format_value, table
+
+_TITLES = {
+    "deterministic": "What the weights prove",
+    "statistical": "What fresh episodes show",
+    "paper": "The paper's conditions, with its margins",
+}
+
+
+def certificate_section(certificate: Certificate) -> str:
+    """The certificate as HTML.
+
+    Args:
+        certificate: the certificate.
+
+    Returns:
+        A ``<section>``; no scripts, no outside resources.
+
+    Source: none.
+
+    Example:
+        >>> layer = Layer("deterministic", [Statement("a", "1 < 2", PROVED, True)])
+        >>> "1 &lt; 2" in certificate_section(Certificate("demo", "0" * 64, "0" * 64, 0.0, {"deterministic": layer}))
+        True
+    """
+    parts = [
+        "<section><h2>Certificate</h2>",
+        f"<p>About the set {{B &le; {certificate.level:g}}} of the agent <b>{escape(certificate.agent)}</b> with weights "
+        f"<code>{escape(certificate.weights[:16])}&hellip;</code>. <code>sspl verify</code> computes it again.</p>",
+    ]
+    for name in _TITLES:
+        if name not in certificate.layers:
+            continue
+        layer = certificate.layers[name]
+        parts.append(f"<h3>{_TITLES[name]}</h3><p>{badge('yes: all hold' if layer.holds else layer.verdict)}</p>")
+        parts.append(table(("Statement", "Status", "Value", "n", "Remark"), [_row(s) for s in layer.statements]))
+    return "".join(parts) + "</section>"
+
+
+def proved_lines(certificate: Certificate) -> list[str]:
+    """The proved statements as sentences, for the head of the report.
+
+    Args:
+        certificate: the certificate.
+
+    Returns:
+        One line for each statement that is proved.
+
+    Source: none.
+
+    Example:
+        >>> layer = Layer("deterministic", [Statement("a", "1 < 2", PROVED, True)])
+        >>> proved_lines(Certificate("demo", "", "", 0.0, {"deterministic": layer}))
+        ['1 < 2.']
+    """
+    lines = []
+    for layer in certificate.layers.values():
+        for s in layer.statements:
+            if s.kind == PROVED and s.holds:
+                value = "" if s.value is None or not s.unit else f" ({format_value(s.value, s.unit)})"
+                lines.append(s.text + value + ".")
+    return lines
+
+
+def _row(statement: Statement) -> list[str]:
+    s = statement
+    if s.kind == ASSUMED:
+        status = "assumed" if s.value is None else "reported"
+    elif s.holds:
+        status = badge("proved" if s.kind == PROVED else "yes: measured")
+    else:
+        miss = "" if s.misses_by is None else f", misses by {format_value(s.misses_by, s.unit)}"
+        status = badge(f"not {s.kind}{miss}" if s.kind == PROVED else f"does not hold{miss}")
+    value = "" if s.value is None else format_value(s.value, s.unit)
+    size = "" if s.n is None else f"{s.n:,}" + ("" if s.confidence is None else f", {100 * s.confidence:g} %")
+    return [escape(s.text), status, escape(value), escape(size), escape(s.detail)]
