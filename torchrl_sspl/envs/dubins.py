@@ -192,6 +192,7 @@ class DubinsEnv(SafetyEnv):
         self.yaw_lag = None if yaw_lag is None else (float(yaw_lag[0]), float(yaw_lag[1]))
         self.obstacle_shape, self.obstacle_half_size = obstacle_shape, float(obstacle_half_size)
         self.obstacle_centre, self.arena_half_size = (centre[0], centre[1]), float(arena_half_size)
+        self.safe_half_size, self.unsafe_half_size = float(safe_half_size), float(unsafe_half_size)
         # Robots a little outside the arena are still seen.
         self._compositor = TopViewCompositor(
             image_size, obstacle=obstacle, half_view=1.2 * arena_half_size, device=self.device

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import (
     FrameEncoder,
     InverseDynamics,
@@ -15,6 +16,7 @@ __all__ = [
     "FrameEncoder",
     "InverseDynamics",
     "LatentDynamics",
+    "MomentEncoder",
     "Policy",
     "SaLaD",
     "as_tensordict_module",

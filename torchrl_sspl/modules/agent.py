@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
 
 WEIGHTS_FILE = "agent.safetensors"
@@ -43,7 +44,7 @@ def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
 
 
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
-ENCODERS: dict[str, type[nn.Module]] = {"FrameEncoder": FrameEncoder}
+ENCODERS: dict[str, type[nn.Module]] = {"FrameEncoder": FrameEncoder, "MomentEncoder": MomentEncoder}
 DYNAMICS: dict[str, type[nn.Module]] = {"LatentDynamics": LatentDynamics}
 POLICIES: dict[str, type[nn.Module]] = {"Policy": Policy}
 

@@ -27,7 +27,7 @@ from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy, make_rollout_policy
-from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.agent import ENCODERS, Agent
 from torchrl_sspl.objectives import SaLaDLoss, SynthesisLoss
 from torchrl_sspl.objectives.latent_viability import (
     barrier_targets,
@@ -124,9 +124,7 @@ class SafePolicyTraining:
         net = config.network
         with torch.random.fork_rng():
             torch.manual_seed(config.seed)
-            self.encoder = FrameEncoder(
-                net.latent_dim, self.env.image_size, pool_to=net.pool_to, velocity_gain=net.velocity_gain
-            )
+            self.encoder = self._new_encoder()
             self.warm_dynamics = LatentDynamics(net.latent_dim, self.env.action_dim, (128, 128), self.env.max_action)
             self.warm_barrier = self._new_barrier()
             self.inverse = InverseDynamics(net.latent_dim, self.env.action_dim, action_scale=self.env.max_action)
@@ -160,6 +158,21 @@ class SafePolicyTraining:
         if resume and (self.out_dir / CHECKPOINT_FILE).is_file():
             self._restore()
         config.save(self.out_dir / "config.json")
+
+    def _new_encoder(self) -> FrameEncoder:
+        net = self.config.network
+        if net.encoder not in ENCODERS:
+            raise ConfigError(f"expected network.encoder to be one of {sorted(ENCODERS)}, received '{net.encoder}'")
+        return ENCODERS[net.encoder](**self._encoder_arguments())  # type: ignore[return-value]
+
+    def _encoder_arguments(self) -> dict[str, Any]:
+        net = self.config.network
+        return {
+            "latent_dim": net.latent_dim,
+            "image_size": self.env.image_size,
+            "pool_to": net.pool_to,
+            "velocity_gain": net.velocity_gain,
+        }
 
     def _new_barrier(self) -> SandwichBarrier:
         net = self.config.network
@@ -277,6 +290,9 @@ class SafePolicyTraining:
         """Warm start: SaLaD on random-action data, of which every frame is stored once."""
         rep = self.config.representation
         stores = self._labelled_stores()
+        if hasattr(self.encoder, "fit") and self.step == 0:
+            mixed = stores["any"].get(torch.arange(min(2000, len(stores["any"]))))
+            self.encoder.fit(mixed["frames"][:, 1])
         loss = SaLaDLoss(
             self.encoder,
             self.warm_dynamics,
@@ -679,15 +695,7 @@ class SafePolicyTraining:
         sizes = {"latent_dim": net.latent_dim, "action_dim": env.action_dim, "action_scale": env.max_action}
         return {
             "networks": {
-                "encoder": {
-                    "class": "FrameEncoder",
-                    "arguments": {
-                        "latent_dim": net.latent_dim,
-                        "image_size": env.image_size,
-                        "pool_to": net.pool_to,
-                        "velocity_gain": net.velocity_gain,
-                    },
-                },
+                "encoder": {"class": net.encoder, "arguments": self._encoder_arguments()},
                 "dynamics": {"class": "LatentDynamics", "arguments": {**sizes, "hidden": net.dynamics_hidden}},
                 "policy": {"class": "Policy", "arguments": {**sizes, "hidden": net.policy_hidden}},
                 "barrier": {"latent_dim": net.latent_dim, "hidden": net.barrier_hidden},

@@ -1,0 +1,144 @@
+"""An encoder that sees where things are and how they are turned, from the centres of colours."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from torchrl_sspl.errors import EmptyRegionError
+from torchrl_sspl.modules.networks import FrameEncoder
+
+
+class ColourMoments(nn.Module):
+    r"""Centre of what differs from the background, per colour, with respect to the statistics of the data.
+
+    .. math:: c_k = \frac{\sum_{ij} |f_{kij} - b_{kij}| (x_j, y_i)}{\sum_{ij} |f_{kij} - b_{kij}|}, \qquad
+        h = \operatorname{diag}(\lambda)^{-1/2} V^\top (c - \mu)
+
+    The background b is the median of frames from different moments; the whitening (:math:`\mu`, and the leading
+    eigenvectors V and eigenvalues of the covariance of c) makes the small distance between the centres of two colours,
+    which tells the heading, as large as the place. All of it comes from frames alone and is set by :meth:`fit`.
+
+    Args:
+        size: height and width of the (pooled) frames.
+        channels: colours.
+        kept: number of leading components kept, at most ``2 * channels``.
+
+    Source: none (the paper does not give an architecture).
+
+    Example:
+        >>> frames = torch.ones(50, 3, 16, 16)
+        >>> places = torch.randint(16, (50, 2), generator=torch.Generator().manual_seed(0))
+        >>> frames[torch.arange(50), :, places[:, 0], places[:, 1]] = 0.0  # one dark pixel each
+        >>> moments = ColourMoments(16, kept=2)
+        >>> moments.fit(frames)
+        >>> moments(frames).std(0).round(decimals=1)
+        tensor([1., 1.])
+    """
+
+    background: Tensor
+    mean: Tensor
+    whitening: Tensor
+    axis: Tensor
+
+    def __init__(self, size: int, channels: int = 3, kept: int = 4) -> None:
+        super().__init__()
+        self.register_buffer("background", torch.ones(channels, size, size))
+        self.register_buffer("mean", torch.zeros(2 * channels))
+        self.register_buffer("whitening", torch.eye(2 * channels)[:, :kept].clone())
+        self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
+
+    def centres(self, frames: Tensor) -> Tensor:
+        """Centres ``(n, 2 c)`` in [-1, 1] of frames ``(n, c, H, W)``: first all x, then all y (down)."""
+        weight = (frames - self.background).abs()
+        # Less than one pixel in a thousand counts as nothing seen: the middle of the frame.
+        mass = weight.sum((-2, -1)).clamp_min(1e-3 * self.axis.numel())
+        x, y = (weight.sum(-2) @ self.axis) / mass, (weight.sum(-1) @ self.axis) / mass
+        return torch.cat([x, y], -1)
+
+    @torch.no_grad()
+    def fit(self, frames: Tensor) -> None:
+        """Take background and whitening from frames ``(n, c, H, W)``.
+
+        Raises:
+            EmptyRegionError: fewer than ten frames.
+        """
+        if len(frames) < 10:
+            raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
+        self.background.copy_(frames[:2000].median(0).values)
+        centre = torch.cat([self.centres(part) for part in frames.split(500)]).double()
+        values, vectors = torch.linalg.eigh(torch.cov(centre.T))
+        kept = self.whitening.shape[1]
+        scale = values[-kept:].clamp_min(1e-8).rsqrt()
+        self.mean.copy_(centre.mean(0))
+        self.whitening.copy_(vectors[:, -kept:] * scale)
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Whitened centres ``(n, kept)`` of frames ``(n, c, H, W)``."""
+        return (self.centres(frames) - self.mean) @ self.whitening
+
+
+class MomentEncoder(FrameEncoder):
+    r"""Frame encoder on the centres of colours, for a scene in which one thing moves before a background.
+
+    .. math:: z_t = \tanh(a \, h_t + \operatorname{MLP}(h_t, k (h_t - h_{t-1}))) \in (-1, 1)^p
+
+    with h the whitened centres of :class:`ColourMoments`. Averages over the frame tell places to a fraction of a pixel
+    and the heading of a robot whose ends differ in colour, at every place alike; the MLP shapes the latent. Before the
+    training :meth:`fit` takes the statistics from frames; no label and no state enters.
+
+    Args:
+        latent_dim: size p of the latent, at most six.
+        image_size: height and width of the frames in pixels; ``None`` accepts any size.
+        pool_to: height and width after average pooling.
+        hidden: width of the MLP.
+        velocity_gain: gain k of the difference of the two frames' centres; 0 where one frame shows all.
+
+    Raises:
+        ConfigError: if a size is not a positive integer.
+
+    Source: paper eq. (7); the paper does not give an architecture.
+
+    Example:
+        >>> encoder = MomentEncoder(latent_dim=4, image_size=128)
+        >>> encoder(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
+        torch.Size([2, 4])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        image_size: int | None = None,
+        *,
+        pool_to: int = 64,
+        hidden: int = 64,
+        velocity_gain: float = 0.0,
+    ) -> None:
+        super().__init__(
+            latent_dim,
+            image_size,
+            pool_to=pool_to,
+            channels=(1,),
+            features=latent_dim,
+            hidden=hidden,
+            velocity_gain=velocity_gain,
+        )
+        self.trunk = nn.Sequential(ColourMoments(pool_to, self.in_channels, latent_dim))
+        self.gain = nn.Parameter(torch.tensor(0.6))
+
+    @torch.no_grad()
+    def fit(self, frames: Tensor) -> None:
+        """Take background and whitening from frames, uint8 ``(n, 3, H, W)`` of different moments."""
+        self._check(frames, self.in_channels, "frames")
+        pooled = torch.cat([F.adaptive_avg_pool2d(part.float(), self.pool_to) for part in frames.split(500)])
+        self.trunk[0].fit(pooled / 127.5 - 1.0)  # type: ignore[operator]
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the centres of two successive frames; see :meth:`FrameEncoder.head`."""
+        motion = self.velocity_gain * (current - previous)
+        shaped = self.latent_head(torch.cat([current, motion], -1))
+        return torch.tanh(self.gain * current + shaped)
+
+
+__all__ = ["ColourMoments", "MomentEncoder"]
