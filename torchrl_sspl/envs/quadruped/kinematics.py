@@ -1,0 +1,136 @@
+"""Closed-form kinematics of the four legs of the Unitree A1.
+
+Everywhere in this package: legs in the order FR, FL, RR, RL, three joints each (abduction, hip, knee), arrays
+``(4, 3)``; base frame x forward, y left, z up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+LEGS = ("FR", "FL", "RR", "RL")
+SIDE = np.array([-1.0, 1.0, -1.0, 1.0])
+ABDUCTION = np.array([[0.183, -0.047, 0.0], [0.183, 0.047, 0.0], [-0.183, -0.047, 0.0], [-0.183, 0.047, 0.0]])
+"""Abduction joints in the base frame, in m."""
+ABDUCTION_LINK, THIGH, SHANK, TOE_RADIUS = 0.08505, 0.2, 0.2, 0.02
+"""Lengths in m; the foot of this module is the centre of the spherical toe."""
+SHOULDER = ABDUCTION + np.stack([0 * SIDE, ABDUCTION_LINK * SIDE, 0 * SIDE], axis=1)
+"""Where the feet are below when the robot stands, in the base frame, in m."""
+
+_REACH = 0.995 * (THIGH + SHANK)
+_KNEE = (-2.69, -0.92)
+_ABDUCTION_LIMIT = 0.8
+
+
+def forward_kinematics(joints: Array) -> tuple[Array, Array]:
+    """Feet and their Jacobians.
+
+    Args:
+        joints: ``(4, 3)`` joint angles in rad.
+
+    Returns:
+        feet ``(4, 3)`` in the base frame in m, and Jacobians ``(4, 3, 3)``, foot velocity per joint velocity.
+
+    Source: geometry of the robot's URDF.
+
+    Example:
+        >>> feet, jacobian = forward_kinematics(np.zeros((4, 3)))
+        >>> feet[1].round(3).tolist()
+        [0.183, 0.132, -0.4]
+    """
+    sin, cos = np.sin(joints), np.cos(joints)
+    knee = joints[:, 1] + joints[:, 2]
+    sin_knee, cos_knee = np.sin(knee), np.cos(knee)
+    # In the plane of the leg: x forward, down along -z; the abduction joint turns that plane about x.
+    x = -THIGH * sin[:, 1] - SHANK * sin_knee
+    z = -THIGH * cos[:, 1] - SHANK * cos_knee
+    y = SIDE * ABDUCTION_LINK
+    s, c = sin[:, 0], cos[:, 0]
+    feet = ABDUCTION + np.stack([x, c * y - s * z, s * y + c * z], axis=1)
+    jacobian = np.zeros((4, 3, 3))
+    jacobian[:, 1, 0], jacobian[:, 2, 0] = ABDUCTION[:, 2] - feet[:, 2], feet[:, 1] - ABDUCTION[:, 1]
+    dx, dz = -SHANK * cos_knee, SHANK * sin_knee
+    jacobian[:, 0, 1], jacobian[:, 0, 2] = z, dx
+    jacobian[:, 1, 1], jacobian[:, 1, 2] = s * x, -s * dz
+    jacobian[:, 2, 1], jacobian[:, 2, 2] = -c * x, c * dz
+    return feet, jacobian
+
+
+def inverse_kinematics(feet: Array) -> Array:
+    """Joint angles that put the feet where they are wanted, or as near as the legs reach.
+
+    Args:
+        feet: ``(4, 3)`` in the base frame in m.
+
+    Returns:
+        ``(4, 3)`` joint angles in rad, within the joint limits, knees bent backwards.
+
+    Source: geometry of the robot's URDF.
+
+    Example:
+        >>> feet = SHOULDER + [0.05, 0.02, -0.28]
+        >>> bool(np.allclose(forward_kinematics(inverse_kinematics(feet))[0], feet))
+        True
+    """
+    x, y, z = (feet - ABDUCTION).T
+    side = SIDE * ABDUCTION_LINK
+    depth = np.sqrt(np.maximum(y * y + z * z - side * side, 1e-4))
+    abduction = np.arctan2(z, y) - np.arctan2(-depth, side)
+    abduction = (abduction + np.pi) % (2 * np.pi) - np.pi
+    squared = np.minimum(x * x + depth * depth, _REACH**2)
+    bend = (squared - THIGH**2 - SHANK**2) / (2 * THIGH * SHANK)
+    knee = -np.arccos(np.clip(bend, -1.0, 1.0))
+    hip = np.arctan2(-x, depth) - np.arctan2(SHANK * np.sin(knee), THIGH + SHANK * np.cos(knee))
+    return np.stack([np.clip(abduction, -_ABDUCTION_LIMIT, _ABDUCTION_LIMIT), hip, np.clip(knee, *_KNEE)], axis=1)
+
+
+def rotation_z(angle: float) -> Array:
+    """Rotation matrix ``(3, 3)`` about the vertical by an angle in rad.
+
+    Example:
+        >>> (rotation_z(np.pi / 2) @ [1.0, 0.0, 0.0]).round(12).tolist()
+        [0.0, 1.0, 0.0]
+    """
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def skew(vectors: Array) -> Array:
+    """Cross-product matrices ``(*batch, 3, 3)`` of vectors ``(*batch, 3)``: ``skew(a) @ b = a x b``.
+
+    Example:
+        >>> (skew(np.array([1.0, 2.0, 3.0])) @ [4.0, 5.0, 6.0]).tolist()
+        [-3.0, 6.0, -3.0]
+    """
+    out = np.zeros((*vectors.shape, 3))
+    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
+    out[..., 0, 1], out[..., 0, 2] = -z, y
+    out[..., 1, 0], out[..., 1, 2] = z, -x
+    out[..., 2, 0], out[..., 2, 1] = -y, x
+    return out
+
+
+def wrap_angle(angle: float) -> float:
+    """Angle in [-pi, pi), in rad.
+
+    Example:
+        >>> round(wrap_angle(3 * np.pi / 2), 6)
+        -1.570796
+    """
+    return float((angle + np.pi) % (2 * np.pi) - np.pi)
+
+
+__all__ = [
+    "ABDUCTION",
+    "LEGS",
+    "SHOULDER",
+    "TOE_RADIUS",
+    "forward_kinematics",
+    "inverse_kinematics",
+    "rotation_z",
+    "skew",
+    "wrap_angle",
+]
