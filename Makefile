@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: pendulum test clean
+.PHONY: pendulum test docs wheel release-check clean
 
 pendulum: $(VENV)/.viz
 	$(BIN)/python examples/inverted_pendulum.py $(ARGS)
@@ -13,6 +13,18 @@ test: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/mypy
 	$(BIN)/python -m pytest -m "not slow and not gpu and not ray"
+
+docs: $(VENV)/.docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+	$(BIN)/python docs/check_site.py build/site tests/api_surface.txt
+	@echo "open build/site/index.html"
+
+wheel: $(VENV)/.release
+	$(BIN)/python -m build
+
+# Builds, installs the wheel into a fresh environment and runs the tests against it, outside the checkout.
+release-check: wheel
+	sh tests/check_wheel.sh $(PYTHON) dist
 
 $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)

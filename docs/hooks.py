@@ -191,6 +191,27 @@ MATH = re.compile(r":math:`((?:[^`])+)`", re.DOTALL)
 BLOCK = re.compile(r"^(?P<indent>[ ]*)\.\. math::(?P<first>[^\n]*)\n(?P<rest>(?:(?P=indent)[ ]+[^\n]*\n|[ ]*\n)*)", re.MULTILINE)
 
 
+TABLE = re.compile(
+    r"^(?P<indent>[ ]*)(?P<rule>=+(?: +=+)+)\n(?P<head>[^\n]*)\n(?P=indent)(?P=rule)\n(?P<body>(?:(?!(?P=indent)=)[^\n]*\n)*?)"
+    r"(?P=indent)(?P=rule)$",
+    re.MULTILINE,
+)
+
+
+def table(match: re.Match[str]) -> str:
+    """A simple table of reStructuredText: columns lie under their rules."""
+    indent = match["indent"]
+    starts = [m.start() for m in re.finditer(r"=+", match["rule"])]
+
+    def row(line: str) -> str:
+        line = line[len(indent) :]
+        cells = [line[a:b].strip() for a, b in zip(starts, [*starts[1:], None], strict=True)]
+        return f"{indent}| {' | '.join(cells)} |"
+
+    rows = [row(line) for line in match["body"].splitlines() if line.strip()]
+    return "\n".join([row(match["head"]), f"{indent}|{'---|' * len(starts)}", *rows])
+
+
 def to_markdown(text: str) -> str:
     r"""Docstrings are written for ``help()`` with the roles of Sphinx; this turns them into Markdown.
 
@@ -208,6 +229,7 @@ def to_markdown(text: str) -> str:
         return f"\n{indent}$$\n{indent}{formula}\n{indent}$$\n\n"
 
     text = BLOCK.sub(block, text + "\n")
+    text = TABLE.sub(table, text)
     text = MATH.sub(lambda match: rf"\({' '.join(match[1].split())}\)", text)
     text = ROLE.sub(lambda match: f"`{match[1].rsplit('.', 1)[-1]}`", text)
     return re.sub(r"``([^`]+)``", r"`\1`", text).rstrip("\n")

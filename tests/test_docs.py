@@ -1,0 +1,151 @@
+"""The documentation: its code runs, its pages name everything public, its checks can fail."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+if not (ROOT / "torchrl_sspl").is_dir():
+    pytest.skip("needs a checkout", allow_module_level=True)
+PAGES = sorted(path for path in DOCS.rglob("*.md"))
+# Theirs take long and run in tests of their own.
+OWN_TESTS = {"tutorials/certify_your_system.md", "bring_your_own.md"}
+
+
+def load(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, DOCS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+hooks, check_site = load("hooks"), load("check_site")
+
+
+def blocks(path: Path) -> list[str]:
+    found = re.findall(r"^```python\n(.*?)^```", path.read_text(), flags=re.DOTALL | re.MULTILINE)
+    return [block for block in found if "--8<--" not in block]
+
+
+CODE = [
+    pytest.param(path, block, id=f"{path.relative_to(DOCS)}-{number}")
+    for path in PAGES
+    if str(path.relative_to(DOCS)) not in OWN_TESTS
+    for number, block in enumerate(blocks(path))
+]
+
+
+@pytest.mark.parametrize(("path", "block"), CODE)
+def test_code_of_the_pages_runs(path, block, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    state = torch.get_rng_state()
+    try:
+        exec(compile(block, str(path), "exec"), {"__name__": "page"})
+    finally:
+        torch.set_rng_state(state)
+
+
+def test_there_is_code_to_run():
+    assert len(CODE) >= 8
+
+
+def test_every_public_name_has_a_place():
+    """Against the snapshot of the public names, without building."""
+    written = hooks.api_index() + "".join(hooks.api_page(part) for part in hooks.parts())
+    lines = (ROOT / "tests" / "api_surface.txt").read_text().splitlines()
+    missing = []
+    for line in lines:
+        package, name = line.split()
+        constants = f"::: {package}.{name}\n" if package != "torchrl_sspl" else f'<a id="torchrl_sspl.{name}"></a>'
+        if constants not in written:
+            missing.append(line)
+    assert not missing
+
+
+def test_every_example_is_in_the_gallery_with_its_code():
+    paths = hooks.examples()
+    assert {p.stem for p in paths} >= {"inverted_pendulum", "plug_into_trainer"}
+    for path in paths:
+        last = path.read_text().rstrip().splitlines()[-1]
+        assert f"examples/{path.name}" in hooks.gallery_index()
+        assert last in hooks.gallery_page(path)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
+def test_links_between_pages_exist(path):
+    generated = {f"gallery/{p.stem}.md" for p in hooks.examples()} | {f"api/{p}.md" for p in hooks.parts()}
+    generated |= {"gallery/index.md", "api/index.md"}
+    text = re.sub(r"^```.*?^```", "", hooks.on_page_markdown(path.read_text()), flags=re.DOTALL | re.MULTILINE)
+    for target in re.findall(r"\]\((?!https?:|mailto:)([^)#\s]+)", text):
+        place = (path.parent / target).resolve()
+        assert place.exists() or str(place.relative_to(DOCS)) in generated, target
+
+
+def test_sections_of_the_readme_are_included_with_their_links_bent():
+    page = hooks.on_page_markdown((DOCS / "results.md").read_text())
+    readme = (ROOT / "README.md").read_text()
+    row = next(line for line in readme.splitlines() if line.startswith("| volume of {B"))
+    assert row in page
+    assert "](docs/" not in page
+    with pytest.raises(ValueError, match="expected a section"):
+        hooks.on_page_markdown("<!-- README: No such section -->")
+
+
+def test_roles_and_formulas_become_markdown():
+    text = "A :math:`a\n    b` of :class:`~x.y.Z` and ``f()``.\n\n.. math:: c\n\n    .. math::\n        d &= e \\\\\n        f\n\nEnd."
+    done = hooks.to_markdown(text)
+    assert "\\(a b\\) of `Z` and `f()`" in done
+    assert "$$\nc\n$$" in done
+    assert "    \\begin{aligned} d &= e \\\\ f \\end{aligned}\n    $$" in done
+    assert done.endswith("End.")
+    for left in (":math:", ".. math", ":class:"):
+        assert left not in done
+
+
+def test_tables_of_docstrings_become_markdown():
+    text = "Keys:\n\n==== =====\nkey  shape\n==== =====\na    b c\n==== =====\n\nEnd."
+    assert "| key | shape |\n|---|---|\n| a | b c |" in hooks.to_markdown(text)
+
+
+@pytest.mark.parametrize(
+    ("page", "problem"),
+    [
+        ('<a href="gone.html">x</a>', "no file"),
+        ('<a href="#gone">x</a>', "no anchor for #gone"),
+        ('<a href="other.html#gone">x</a>', "no anchor for other"),
+        ('<script src="https://elsewhere.example/x.js"></script>', "loads"),
+        ('<link rel="stylesheet" href="//elsewhere.example/x.css">', "loads"),
+        ("", "public name pkg.name"),
+    ],
+)
+def test_a_broken_site_is_seen(tmp_path, page, problem):
+    (tmp_path / "index.html").write_text(page)
+    (tmp_path / "other.html").write_text('<h2 id="there">x</h2>')
+    found = check_site.problems(tmp_path, ["pkg.name"] if not page else [])
+    assert len(found) == 1
+    assert problem in found[0]
+
+
+def test_a_good_site_passes(tmp_path):
+    (tmp_path / "index.html").write_text('<a href="other.html#pkg.name">x</a> <a href="https://example.org">y</a>')
+    (tmp_path / "other.html").write_text('<h2 id="pkg.name">x</h2> <a href="#pkg.name">up</a>')
+    assert check_site.problems(tmp_path, ["pkg.name"]) == []
+
+
+@pytest.mark.slow
+def test_site_builds_without_warnings_and_passes_its_checks(tmp_path):
+    pytest.importorskip("mkdocstrings")
+    build = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(tmp_path)]
+    done = subprocess.run(build, cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-3000:]
+    names = [".".join(line.split()) for line in (ROOT / "tests" / "api_surface.txt").read_text().splitlines()]
+    assert check_site.problems(tmp_path, names) == []
