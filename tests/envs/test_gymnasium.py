@@ -79,6 +79,14 @@ def test_first_frames_show_the_motion_of_one_step():
     assert (position(pixels[:3]).item(), position(pixels[3:]).item()) == (6, 9)  # middle action 5, less 2
 
 
+def test_systems_at_rest_start_where_they_are_put():
+    env = slider(1, reset_options={"x": 6.0}, settle=False)
+    data = env.reset()
+    assert torch.equal(data["pixels"][0, :3], data["pixels"][0, 3:])
+    assert data["state"].item() == 6.0
+    assert not env._envs[0].actions
+
+
 def test_reset_options_may_be_drawn():
     env = slider(4, reset_options=lambda random: {"x": float(random.integers(0, 3))})
     assert env.reset()["state"].max() <= 3

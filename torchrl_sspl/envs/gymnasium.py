@@ -41,7 +41,8 @@ class GymnasiumPixels(EnvBase):
     own units: :math:`u_{gym} = (low + high) / 2 + u`. For ``Discrete(k)`` the interval [-1, 1] is cut into k equal
     parts, in the order of gymnasium's numbers.
 
-    A reset is followed by one step with the action zero, so that the two first frames show motion.
+    A reset is followed by one step with the action zero, so that the two first frames show motion. Where systems start
+    at rest, ``settle=False`` leaves the step out, and the two first frames are the same.
 
     Args:
         make: ``() -> gymnasium.Env`` with ``render_mode="rgb_array"``; called n times.
@@ -51,6 +52,7 @@ class GymnasiumPixels(EnvBase):
         image_size: height and width of the frames, in pixels; pictures are averaged down to it.
         horizon: steps after which an episode is truncated; ``None`` leaves that to gymnasium.
         reset_options: ``options`` of gymnasium's reset, or ``(numpy generator) -> options``.
+        settle: let one step pass after a reset.
         device: device of the tensors.
         seed: seed of the resets.
 
@@ -83,6 +85,7 @@ class GymnasiumPixels(EnvBase):
         image_size: int = 64,
         horizon: int | None = None,
         reset_options: Mapping[str, Any] | Callable[[np.random.Generator], Mapping[str, Any]] | None = None,
+        settle: bool = True,
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
@@ -95,7 +98,8 @@ class GymnasiumPixels(EnvBase):
             raise ConfigError(f"image_size: expected an integer >= 8, received {image_size!r}.")
         super().__init__(device=torch.device(device or "cpu"), batch_size=size)
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
-        self.image_size, self.horizon, self.reset_options = image_size, horizon, reset_options
+        self.image_size, self.horizon = image_size, horizon
+        self.reset_options, self.settle = reset_options, settle
         self._safe, self._unsafe = safe, unsafe
         self._envs = [make() for _ in range(size[0])]
         first = self._envs[0]
@@ -186,13 +190,15 @@ class GymnasiumPixels(EnvBase):
         return SAFE if safe else UNSAFE if unsafe else UNLABELLED
 
     def _restart(self, index: int) -> Tensor:
-        """Reset one environment and let one step pass; returns the frame of the reset."""
+        """Reset one environment and, to settle it, let one step pass; returns the frame of the reset."""
         env = self._envs[index]
         for _ in range(_ATTEMPTS):
             options = self.reset_options(self._random) if callable(self.reset_options) else self.reset_options
             seed = int(self._random.integers(2**31 - 1))
-            env.reset(seed=seed, options=None if options is None else dict(options))
+            observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
             before = self._draw(index)
+            if not self.settle:
+                break
             observation, _, terminated, truncated, info = env.step(self._native_action(np.zeros(self.action_dim)))
             if not (terminated or truncated):
                 break

@@ -1,0 +1,26 @@
+"""The same path for gymnasium's CartPole: discrete actions, S and U as predicates on the state, the default encoder.
+
+python examples/bring_your_own_cartpole.py [key=value ...]     needs: pip install 'torchrl-sspl[viz]'
+"""
+
+import sys
+from functools import partial
+
+import gymnasium
+
+from torchrl_sspl.envs import GymnasiumPixels
+from torchrl_sspl.trainers.experiment import run_experiment
+
+my_env = partial(
+    GymnasiumPixels,
+    lambda: gymnasium.make("CartPole-v1", render_mode="rgb_array"),
+    safe=lambda state, info: abs(state[2]) < 0.03 and abs(state[3]) < 0.3,  # pole angle in rad, rate in rad/s
+    unsafe=lambda state, info: abs(state[2]) > 0.15,
+    reset_options={"low": -0.12, "high": 0.12},
+    image_size=64,
+    horizon=40,
+)
+
+if __name__ == "__main__":
+    outcome = run_experiment(my_env, sys.argv[1:], title="CartPole from pixels", out_dir="runs/cartpole")
+    print(outcome.summary(), f"\nreport: {outcome.report}")

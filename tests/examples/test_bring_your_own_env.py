@@ -1,0 +1,79 @@
+"""Systems that the library has never seen: few lines, and a run from the simulator to the report."""
+
+from __future__ import annotations
+
+import ast
+import importlib.util
+import json
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from torchrl_sspl.errors import EmptyRegionError
+from torchrl_sspl.modules import agent as registry
+from torchrl_sspl.modules.agent import load
+from torchrl_sspl.trainers.episodes import evaluate_episodes
+from torchrl_sspl.trainers.experiment import run_experiment
+from torchrl_sspl.trainers.experiment_config import EpisodesConfig
+
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+EXAMPLES = Path(__file__).parents[2] / "examples"
+FILES = ["bring_your_own_env.py", "bring_your_own_cartpole.py"]
+TINY = [
+    "trainer.total_frames=160", "trainer.optim_steps_per_batch=3", "trainer.warm_start_steps=3", "trainer.progress=false",
+    "trainer.checkpoint_every=-1", "collector.frames_per_batch=80", "collector.envs=4", "collector.init_random_frames=80",
+    "network.barrier_hidden=[8]", "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "buffer.batch=16",
+    "evaluation.episodes=6", "evaluation.envs=3", "evaluation.horizon=6",
+]  # fmt: skip
+
+
+def example(name: str):
+    if name == "bring_your_own_env.py":
+        pytest.importorskip("gym_pusht", reason="needs the extra examples")
+    spec = importlib.util.spec_from_file_location(name.removesuffix(".py"), EXAMPLES / name)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_the_example_is_at_most_forty_lines(name):
+    source = (EXAMPLES / name).read_text()
+    docstring = ast.parse(source).body[0]
+    lines = [line.strip() for line in source.splitlines()[docstring.end_lineno :]]
+    assert sum(bool(line) and not line.startswith("#") for line in lines) <= 40
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_from_the_simulator_to_the_report(name, tmp_path, monkeypatch):
+    module = example(name)
+    encoder = getattr(module, "Encoder", None)
+    outcome = run_experiment(module.my_env, TINY, encoder=encoder, title="Tiny", out_dir=str(tmp_path))
+    measured = json.loads((tmp_path / "metrics.json").read_text())["measurements"]
+    assert measured["random_touch_unsafe"]["n"] == measured["starts_inside"]["n"] == 6
+    page = outcome.report.read_text()
+    assert "Tiny" in page
+    assert "data:image/gif" in page
+    assert "exact integer arithmetic" in page
+    assert "episodes from B &lt;= 0 that touch U" in page or "touch_unsafe" in page
+    for name in ("csv/scalars/loss_unsafe.csv", "csv/scalars/eval_touch_unsafe.csv", "csv/videos"):
+        assert (tmp_path / name).exists()
+    if encoder is not None:
+        monkeypatch.setitem(registry.ENCODERS, "Encoder", encoder)
+    again = evaluate_episodes(load(tmp_path), module.my_env, EpisodesConfig(episodes=6, envs=3, horizon=6))
+    assert again["starts_inside"] == outcome.evaluation["starts_inside"]
+
+
+def test_the_same_seed_gives_the_same_agent(tmp_path):
+    module = example("bring_your_own_cartpole.py")
+    runs = [run_experiment(module.my_env, TINY, out_dir=str(tmp_path / k)) for k in "ab"]
+    first, second = (run.agent.state_dict() for run in runs)
+    assert all((first[name] == second[name]).all() for name in first)
+
+
+def test_a_set_that_is_never_seen_is_named(tmp_path):
+    module = example("bring_your_own_cartpole.py")
+    never = partial(module.my_env, unsafe=lambda state, info: False)
+    with pytest.raises(EmptyRegionError, match=r"unsafe transitions.*reset_options.*buffer\.unsafe"):
+        run_experiment(never, TINY, out_dir=str(tmp_path))
