@@ -10,6 +10,7 @@ import ast
 import html
 import logging
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def documented(part: str) -> list[str]:
     if not root.is_dir():
         return [f"{PACKAGE}.{part}.{name}" for name in definitions(root.with_suffix(".py"))]
     public = exported(root / "__init__.py")
-    names = [f"{PACKAGE}.{part}.{name}" for name in public]
+    names = [f"{PACKAGE}.{part}.{name}" for name in sorted(public, key=lambda name: (name.isupper(), name))]
     for path in sorted(root.rglob("*.py")):
         inner = path.relative_to(root).with_suffix("").parts
         if any(piece.startswith("_") for piece in inner):
@@ -150,38 +151,34 @@ def examples() -> list[Path]:
 
 
 def gallery_title(path: Path) -> str:
+    """First phrase of an example's docstring."""
     first = (ast.get_docstring(ast.parse(path.read_text())) or path.stem).split("\n")[0]
-    return re.split(r"[:.](?:\s|$)", first)[0]
+    return re.split(r"[:.,;](?:\s|$)", first)[0]
 
 
-def gallery_images(path: Path) -> list[Path]:
-    """Pictures of an example: docs/images/<example>*.png, or those named in docs/images/<example>.txt order."""
-    return sorted((ROOT / "docs" / "images").glob(f"{path.stem}*.png"))
+def gallery_pictures(path: Path) -> dict[str, str]:
+    """Pictures of an example and their captions."""
+    return tomllib.loads((ROOT / "docs" / "images" / "captions.toml").read_text()).get(path.stem, {})
 
 
 def gallery_page(path: Path) -> str:
     source = path.read_text()
-    doc = ast.get_docstring(ast.parse(source)) or ""
-    blocks = doc.split("\n\n")
-    text = "\n\n".join(blocks[1:] if len(blocks) > 1 else [])
-    lines = [f"# {gallery_title(path)}", "", to_markdown(blocks[0]), "", to_markdown(text), ""]
-    for image in gallery_images(path):
-        caption = image.with_suffix(".txt")
-        words = " ".join(caption.read_text().split()) if caption.exists() else gallery_title(path)
-        lines += [f"![{words}](../images/{image.name})", "", f"*{words}*", ""]
-    body = source[source.index('"""', 3) + 3 :].lstrip("\n") if source.startswith(('"""', 'r"""')) else source
-    lines += [f"`examples/{path.name}`", "", "```python", body.rstrip(), "```", ""]
-    return "\n".join(lines)
+    doc = to_markdown(ast.get_docstring(ast.parse(source)) or "")
+    lines = [f"# {gallery_title(path)}", "", doc, ""]
+    for name, words in gallery_pictures(path).items():
+        lines += [f"![{words}](../images/{name})", "", f"*{words}*", ""]
+    code = source.split('"""', 2)[2].lstrip("\n") if source.startswith(('"""', 'r"""')) else source
+    return "\n".join([*lines, f"`examples/{path.name}`", "", "```python", code.rstrip(), "```", ""])
 
 
 def gallery_index() -> str:
     lines = ["# Gallery", "", "Every example is run by the tests. Start one with `python examples/<name>.py`.", ""]
-    lines += ["| Example | |", "|---|---|"]
     for path in examples():
-        pictures = gallery_images(path)
-        shown = f"[![{gallery_title(path)}](../images/{pictures[0].name}){{ width=160 }}]({path.stem}.md)" if pictures else ""
-        lines.append(f"| [{gallery_title(path)}]({path.stem}.md)<br>`examples/{path.name}` | {shown} |")
-    return "\n".join([*lines, ""])
+        title = gallery_title(path)
+        lines += [f"## [{title}]({path.stem}.md)", "", f"`examples/{path.name}`", ""]
+        for name, words in list(gallery_pictures(path).items())[:1]:
+            lines += [f"[![{words}](../images/{name}){{ width=420 }}]({path.stem}.md)", ""]
+    return "\n".join(lines)
 
 
 # ------------------------------------------------- reStructuredText to Markdown
@@ -294,7 +291,8 @@ def readme_section(title: str) -> str:
     found = re.search(rf"^## {re.escape(title)}\n(.*?)(?=^## |\Z)", (ROOT / "README.md").read_text(), re.DOTALL | re.MULTILINE)
     if found is None:
         raise ValueError(f"expected a section '{title}' in README.md, found none: rename it in the page that includes it")
-    text = re.sub(r"\]\(docs/", "](", found[1])
+    text = found[1].replace("[docs/deviations.md](", "[Deviations](")
+    text = re.sub(r"\]\(docs/", "](", text)
     return re.sub(r"\]\(examples/(\w+)\.py\)", r"](gallery/\1.md)", text).strip()
 
 
