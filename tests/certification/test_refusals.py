@@ -1,0 +1,384 @@
+"""Broken twins of a valid agent, each refused for the reason that it was broken for."""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from torchrl_sspl.certification.branch_and_bound import Budget
+from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, differences
+from torchrl_sspl.certification.layers import (
+    Sample,
+    deterministic_layer,
+    fingerprint,
+    level_that_holds,
+    paper_layer,
+    statistical_layer,
+)
+from torchrl_sspl.errors import CertificationError, CheckpointError, ConfigError
+from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.trainers.certify import certify, verify_run
+
+
+def linear(weight: Any, bias: Any = None) -> nn.Linear:
+    weight = torch.as_tensor(weight, dtype=torch.float32)
+    layer = nn.Linear(weight.shape[1], weight.shape[0])
+    layer.weight.data.copy_(weight)
+    layer.bias.data.copy_(torch.zeros(len(weight)) if bias is None else torch.as_tensor(bias, dtype=torch.float32))
+    return layer.requires_grad_(False)
+
+
+class Residual(nn.Module):
+    """z + net(z, u), clamped; and scale clamp(net(z)): the forms of the library's dynamics and policy."""
+
+    def __init__(self, net: nn.Sequential, action_scale: float = 2.0) -> None:
+        super().__init__()
+        self.net, self.action_scale = net, torch.tensor([action_scale])
+
+
+def parts() -> dict[str, Any]:
+    """z1+ = 1.8 z1 + 0.6 v with v = clamp(-2 z1), z2+ = z2 / 2; B = |z|_1 - 1/2.
+
+    Where |z1| <= 1/2 the policy is not saturated and z1+ = 0.6 z1; beyond |z1| = 3/4 it is too weak.
+    """
+    eye = torch.eye(2)
+    signs = torch.cat([eye, -eye])
+    barrier = nn.Sequential(linear(signs), nn.ReLU(), linear(torch.ones(1, 4), [-0.5]))
+    first = linear(torch.cat([signs, torch.tensor([[0.75], [0.0], [-0.75], [0.0]])], 1))
+    last = linear([[0.8, 0.0, -0.8, 0.0], [0.0, -0.5, 0.0, 0.5]])
+    policy = nn.Sequential(linear(signs), nn.ReLU(), linear([[-2.0, 0.0, 2.0, 0.0]]))
+    return {
+        "barrier": barrier,
+        "dynamics": Residual(nn.Sequential(first, nn.ReLU(), last)),
+        "policy": Residual(policy),
+        "latent_dim": 2,
+        "lipschitz_bound": 1.5,
+    }
+
+
+def test_valid_agent_is_certified_with_the_error_that_it_tolerates():
+    layer = deterministic_layer(**parts())
+    assert layer.holds, layer.verdict
+    assert layer.reasons == []
+    # B(z+) <= 0.6 |z|_1 - 0.5 <= -0.2: errors up to 0.2 / 1.5.
+    assert layer["tolerated error"].value == pytest.approx(0.2 / 1.5, abs=2e-3)
+    assert layer["tolerated error"].value <= 0.2 / 1.5
+
+
+# --- deterministic: what follows from the weights ---------------------------------------------------------------------
+
+
+def last_bias(net: nn.Sequential, shift: float) -> None:
+    net[-1].bias.data.add_(shift)
+
+
+def scale_all(net: nn.Sequential, factor: float) -> None:
+    net[-1].weight.data.mul_(factor)
+    net[-1].bias.data.mul_(factor)
+
+
+class Odd(nn.Module):
+    def forward(self, value: Tensor) -> Tensor:
+        return value.sin()
+
+
+def change(**values: Any) -> Callable[[dict[str, Any]], None]:
+    return lambda p: p.update(values)
+
+
+DETERMINISTIC: dict[str, tuple[Callable[[dict[str, Any]], Any], Reason]] = {
+    "barrier shifted down, the set reaches where the plant runs away": (lambda p: last_bias(p["barrier"], -0.3), Reason.NOT_INVARIANT),
+    "barrier shifted up, nothing is left": (lambda p: last_bias(p["barrier"], 1.0), Reason.EMPTY),
+    "barrier negative everywhere": (lambda p: last_bias(p["barrier"], -3.0), Reason.EVERYTHING),
+    "barrier constant and negative": (
+        lambda p: (p["barrier"][-1].weight.data.zero_(), p["barrier"][-1].bias.data.fill_(-0.1)), Reason.EVERYTHING),
+    "barrier constant and positive": (
+        lambda p: (p["barrier"][-1].weight.data.zero_(), p["barrier"][-1].bias.data.fill_(0.1)), Reason.EMPTY),
+    "barrier turned round": (lambda p: scale_all(p["barrier"], -1.0), Reason.NOT_INVARIANT),
+    "barrier scaled up, the constant is a lie": (lambda p: scale_all(p["barrier"], 3.0), Reason.LIPSCHITZ_NOT_PROVED),
+    "Lipschitz constant lied about": (change(lipschitz_bound=1.2), Reason.LIPSCHITZ_NOT_PROVED),
+    "Lipschitz constant with a worthless witness": (change(multipliers=[torch.full((4,), 1e-3)]), Reason.LIPSCHITZ_NOT_PROVED),
+    "one weight of the barrier grown": (lambda p: p["barrier"][0].weight.data[0].mul_(4.0), Reason.LIPSCHITZ_NOT_PROVED),
+    "barrier with NaN": (lambda p: p["barrier"][0].weight.data[0, 0].fill_(math.nan), Reason.NOT_FINITE),
+    "policy with infinity": (lambda p: p["policy"].net[0].bias.data[0].fill_(math.inf), Reason.NOT_FINITE),
+    "dynamics with NaN": (lambda p: p["dynamics"].net[-1].bias.data[0].fill_(math.nan), Reason.NOT_FINITE),
+    "policy turned round": (lambda p: scale_all(p["policy"].net, -1.0), Reason.NOT_INVARIANT),
+    "policy switched off": (lambda p: scale_all(p["policy"].net, 0.0), Reason.NOT_INVARIANT),
+    "policy with an offset": (lambda p: last_bias(p["policy"].net, 0.5), Reason.NOT_INVARIANT),
+    "plant that is stronger than its policy": (lambda p: p["dynamics"].net[0].weight.data[:, 0].mul_(2.0), Reason.NOT_INVARIANT),
+    "plant that drifts": (lambda p: p["dynamics"].net[-1].bias.data[1].fill_(0.4), Reason.NOT_INVARIANT),
+    "more error required than is tolerated": (change(required_error=0.14), Reason.MARGIN_TOO_SMALL),
+    "domain too small for the dynamics": (change(low=-0.3, high=0.3), Reason.LEAVES_DOMAIN),
+    "level above zero": (change(level=0.1), Reason.LEVEL),
+    "level below everything": (change(level=-0.6), Reason.EMPTY),
+    "no time": (change(budget=Budget(boxes=0)), Reason.UNDECIDED),
+    "activation without known bounds": (lambda p: p.update(barrier=nn.Sequential(*p["barrier"][:1], nn.GELU(), *p["barrier"][2:])), Reason.NOT_UNDERSTOOD),
+    "a module of another form": (change(dynamics=Odd()), Reason.NOT_UNDERSTOOD),
+    "policy of another size": (lambda p: p.update(policy=Residual(nn.Sequential(linear(torch.ones(1, 3))))), Reason.NOT_UNDERSTOOD),
+    "two action scales": (lambda p: p.update(policy=Residual(p["policy"].net, 1.0)), Reason.NOT_UNDERSTOOD),
+    "a hook that changes what the barrier computes": (
+        lambda p: p["barrier"][0].register_forward_hook(lambda m, i, o: o - 1.0), Reason.NOT_UNDERSTOOD),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", DETERMINISTIC)
+def test_deterministic_layer_refuses(name):
+    breaking, reason = DETERMINISTIC[name]
+    twin = parts()
+    if "action scale" not in name and reason is Reason.LEAVES_DOMAIN:
+        # Without the clamp the domain is something that has to be shown.
+        eye = torch.eye(2)
+        twin["dynamics"] = nn.Sequential(linear(torch.cat([1.2 * eye, torch.zeros(2, 1)], 1)))
+        twin["policy"] = nn.Sequential(linear(torch.zeros(1, 2)))
+    breaking(twin)
+    layer = deterministic_layer(**twin)
+    assert not layer.holds
+    assert layer.reasons[0] is reason, layer.reasons
+    assert layer.verdict.startswith("not certified")
+
+
+def test_counterexample_is_named_and_measures_the_miss():
+    twin = parts()
+    scale_all(twin["policy"].net, 0.0)
+    refused = deterministic_layer(**twin)["invariance"]
+    assert refused.misses_by > 0.1
+    assert "counterexample" in refused.detail
+
+
+def test_level_is_lowered_where_zero_fails():
+    twin = parts()
+    last_bias(twin["barrier"], -0.3)  # {B <= 0} is |z|_1 <= 0.8; it is kept up to |z|_1 <= 0.75
+    kind = {k: twin[k] for k in ("barrier", "dynamics", "policy", "latent_dim", "lipschitz_bound")}
+    level = level_that_holds(**kind, levels=[0.0, -0.02, -0.1, -0.2])
+    assert level == -0.1
+    assert deterministic_layer(**twin, level=level).holds
+
+
+# --- statistical: what fresh episodes show ----------------------------------------------------------------------------
+
+
+def sample(**changes: Any) -> Sample:
+    g = torch.Generator().manual_seed(0)
+    observations = torch.rand(4000, 4, generator=g)
+    good = Sample(
+        error=0.05 * torch.rand(3000, generator=g),
+        left=torch.zeros(3000, dtype=torch.bool),
+        unsafe=0.1 + torch.rand(3000, generator=g),
+        latent=2 * torch.rand(500, 2, generator=g) - 1,
+        horizon=200,
+        seed=7,
+        used_seeds=(0, 1),
+        fingerprints=fingerprint(observations),
+        trained_on=fingerprint(observations + 2.0),
+    )
+    return replace(good, **changes)
+
+
+def with_events(values: Tensor, n: int, to: float) -> Tensor:
+    values = values.clone()
+    values[:n] = to
+    return values
+
+
+def test_valid_sample_holds_and_states_its_confidence():
+    layer = statistical_layer(sample(), tolerated_error=0.1)
+    assert layer.holds, layer.verdict
+    assert layer["risk"].value == pytest.approx(2 * (1 - 0.025 ** (1 / 3000)), rel=1e-3)
+    assert layer["risk"].confidence == 0.95
+    assert "0 of 3000" in layer["errors tolerated"].text
+
+
+good = sample()
+STATISTICAL: dict[str, tuple[dict[str, Any], Reason]] = {
+    "episodes leave": ({"left": with_events(good.left, 60, True)}, Reason.EPISODES_LEAVE),
+    "encoder that aliases unsafe images": ({"unsafe": with_events(good.unsafe, 60, -0.2)}, Reason.UNSAFE_INSIDE),
+    "unsafe images on the border": ({"unsafe": with_events(good.unsafe, 60, 0.0)}, Reason.UNSAFE_INSIDE),
+    "too few episodes": ({"error": good.error[:100], "left": good.left[:100]}, Reason.TOO_FEW),
+    "too few unsafe observations": ({"unsafe": good.unsafe[:100]}, Reason.TOO_FEW),
+    "no episodes": ({"error": good.error[:0], "left": good.left[:0]}, Reason.NOT_MEASURED),
+    "no unsafe observations": ({"unsafe": good.unsafe[:0]}, Reason.NOT_MEASURED),
+    "NaN among the errors": ({"error": with_events(good.error, 1, math.nan)}, Reason.NOT_FINITE),
+    "NaN among the barrier values": ({"unsafe": with_events(good.unsafe, 1, math.nan)}, Reason.NOT_FINITE),
+    "seed of the training": ({"seed": 1}, Reason.CALIBRATION_REUSED),
+    "the same episode twice": ({"fingerprints": ["a", "b", "a"]}, Reason.CALIBRATION_REUSED),
+    "labels of the training": ({"trained_on": [good.fingerprints[5]]}, Reason.LABELS_LEAKED),
+    "latents outside the domain": ({"latent": with_events(good.latent, 1, 1.5)}, Reason.OUTSIDE_DOMAIN),
+}
+
+
+@pytest.mark.parametrize("name", STATISTICAL)
+def test_statistical_layer_refuses(name):
+    changes, reason = STATISTICAL[name]
+    layer = statistical_layer(sample(**changes), tolerated_error=0.1)
+    assert not layer.holds
+    assert layer.reasons[0] is reason, layer.reasons
+
+
+def test_errors_beyond_the_tolerated_are_said_in_words():
+    layer = statistical_layer(sample(error=good.error + 1.0), tolerated_error=0.1)
+    remark = layer["errors tolerated"]
+    assert "3000 of 3000" in remark.text
+    assert "covers no episode" in remark.detail
+    assert layer.holds  # what is measured directly does not rest on it
+
+
+# --- paper ------------------------------------------------------------------------------------------------------------
+
+
+def conditions(**changes: Any) -> Layer:
+    values: dict[str, Any] = dict(
+        safe=torch.tensor([-1.0]), unsafe=torch.tensor([1.0]), following=torch.tensor([-1.0]),
+        lipschitz_bound=2.0, covering_radius=0.1, dynamics_error=0.05, closed_loop_constant=2.0,
+    )  # fmt: skip
+    return paper_layer(**{**values, **changes})
+
+
+def test_valid_paper_conditions_hold():
+    assert conditions().holds
+
+
+@pytest.mark.parametrize(
+    ("name", "changes", "reason"),
+    [
+        ("q1", {"safe": torch.tensor([-1.0, -0.1])}, Reason.CONDITION_FAILS),
+        ("q2", {"unsafe": torch.tensor([0.1, 1.0])}, Reason.CONDITION_FAILS),
+        ("q3", {"following": torch.tensor([-0.2])}, Reason.CONDITION_FAILS),
+        ("q3 as its proof needs it", {"following": torch.tensor([-0.5])}, Reason.CONDITION_FAILS),
+        ("q3", {"dynamics_error": 3.0}, Reason.CONDITION_FAILS),
+        ("q1", {"safe": torch.zeros(0)}, Reason.NOT_MEASURED),
+        ("q3", {"dynamics_error": math.nan}, Reason.NOT_FINITE),
+    ],
+)
+def test_paper_layer_refuses(name, changes, reason):
+    layer = conditions(**changes)
+    failed = next(s for s in layer.statements if s.holds is False)
+    assert failed.name == name
+    assert failed.reason == reason.name
+
+
+# --- the file: verification finds every change ------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def issued(tmp_path_factory):
+    """An agent made of the parts above, with a certificate of its proof."""
+    directory = tmp_path_factory.mktemp("agent")
+    sizes = {"latent_dim": 2, "action_dim": 1, "action_scale": 2.0, "hidden": [4]}
+    networks = {
+        "encoder": {"class": "FrameEncoder", "arguments": {"latent_dim": 2, "image_size": 32}},
+        "dynamics": {"class": "LatentDynamics", "arguments": sizes},
+        "policy": {"class": "Policy", "arguments": sizes},
+        "barrier": {"latent_dim": 2, "hidden": [4]},
+    }
+    p = parts()
+    dynamics, policy = LatentDynamics(**sizes), Policy(**sizes)
+    dynamics.net.load_state_dict(p["dynamics"].net.state_dict())
+    policy.net.load_state_dict(p["policy"].net.state_dict())
+    description = {"networks": networks, "training": {"seed": 1}}
+    agent = Agent(FrameEncoder(2, 32), dynamics, p["barrier"], policy, p["lipschitz_bound"], description)
+    agent.save(directory)
+    certify(agent, None, name="twin").save(directory / "certificate.json")
+    return directory
+
+
+def run_verify(directory) -> tuple[int, str]:
+    lines: list[str] = []
+    code = verify_run(directory, report=lines.append)
+    return code, "\n".join(lines)
+
+
+def copy_of(issued, tmp_path):
+    for file in issued.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return tmp_path
+
+
+def edit(directory, change: Callable[[dict[str, Any]], Any]) -> None:
+    file = directory / "certificate.json"
+    body = json.loads(file.read_text())
+    change(body)
+    file.write_text(json.dumps(body))
+
+
+def test_untouched_certificate_verifies(issued):
+    code, text = run_verify(issued)
+    assert code == 0, text
+    assert "OK" in text
+
+
+def nudge(directory) -> None:
+    state = load_file(directory / "agent.safetensors")
+    state["policy.net.0.weight"][0, 0] += 1e-6
+    save_file(state, directory / "agent.safetensors")
+
+
+def configure(directory) -> None:
+    file = directory / "agent.json"
+    body = json.loads(file.read_text())
+    body["training"]["seed"] = 99
+    file.write_text(json.dumps(body))
+
+
+def statement(body: dict[str, Any], name: str) -> dict[str, Any]:
+    return next(s for s in body["layers"]["deterministic"]["statements"] if s["name"] == name)
+
+
+FILES: dict[str, tuple[Callable[[Any], Any], Reason]] = {
+    "weights edited after certification": (nudge, Reason.WEIGHTS_CHANGED),
+    "configuration edited": (configure, Reason.CONFIGURATION_CHANGED),
+    "tolerated error raised": (lambda d: edit(d, lambda b: statement(b, "tolerated error").update(value=0.5)), Reason.NUMBERS_CHANGED),
+    "Lipschitz constant lowered": (lambda d: edit(d, lambda b: statement(b, "Lipschitz constant").update(value=1.0)), Reason.NUMBERS_CHANGED),
+    "statement reworded": (lambda d: edit(d, lambda b: statement(b, "invariance").update(text="is safe")), Reason.NUMBERS_CHANGED),
+    "measured called proved": (lambda d: edit(d, lambda b: statement(b, "rounding").update(kind="measured")), Reason.NUMBERS_CHANGED),
+    "statement removed": (lambda d: edit(d, lambda b: b["layers"]["deterministic"]["statements"].pop(3)), Reason.NUMBERS_CHANGED),
+    "layer removed": (lambda d: edit(d, lambda b: b["layers"].clear()), Reason.NUMBERS_CHANGED),
+    "level raised": (lambda d: edit(d, lambda b: b.update(level=0.05)), Reason.NUMBERS_CHANGED),
+    "verdict reworded": (lambda d: edit(d, lambda b: b["layers"]["deterministic"].update(verdict="not certified")), Reason.SCHEMA_UNKNOWN),
+    "another version": (lambda d: edit(d, lambda b: b.update(schema=2)), Reason.SCHEMA_UNKNOWN),
+    "not JSON": (lambda d: (d / "certificate.json").write_text("{"), Reason.SCHEMA_UNKNOWN),
+    "a field too many": (lambda d: edit(d, lambda b: b.update(extra=1)), Reason.SCHEMA_UNKNOWN),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_verification_refuses(name, issued, tmp_path):
+    breaking, reason = FILES[name]
+    directory = copy_of(issued, tmp_path)
+    breaking(directory)
+    code, text = run_verify(directory)
+    assert code == 1
+    assert reason.name in text, text
+
+
+def test_missing_certificate_and_broken_weights_are_errors(issued, tmp_path):
+    directory = copy_of(issued, tmp_path)
+    (directory / "certificate.json").unlink()
+    with pytest.raises(CertificationError, match=r"certificate\.json"):
+        verify_run(directory)
+    state = load_file(directory / "agent.safetensors")
+    state["barrier.0.weight"][0, 0] = math.nan
+    save_file(state, directory / "agent.safetensors")
+    (directory / "certificate.json").write_bytes((issued / "certificate.json").read_bytes())
+    with pytest.raises(CheckpointError, match="finite"):
+        verify_run(directory)
+
+
+def test_differences_of_a_certificate_with_itself_are_none(issued):
+    one = Certificate.load(issued / "certificate.json")
+    assert differences(one, copy.deepcopy(one)) == {}
+
+
+def test_numbers_out_of_range_are_errors():
+    with pytest.raises(ConfigError, match="confidence"):
+        statistical_layer(sample(), confidence=1.0)
+    assert len(DETERMINISTIC) + len(STATISTICAL) + len(FILES) >= 50
