@@ -117,3 +117,10 @@ def test_evaluation_measures_an_untrained_agent_without_flattering_it(uninterrup
     for measurement in found.measurements.values():
         if measurement.unit == "share" and measurement.n:
             assert 0.0 <= measurement.lower <= measurement.value <= measurement.upper <= 1.0
+
+
+def test_counterexamples_of_the_whole_domain_are_found_and_trained_on(uninterrupted):
+    trained = training(uninterrupted[0])
+    found = trained.counterexamples
+    assert 0 < len(found) <= 8
+    assert bool((found.abs() <= 1).all())

@@ -115,6 +115,8 @@ class SynthesisConfig:
         band: barrier value up to which R3 is asked.
         batch: latents per step.
         lr: peak learning rate of the fine-tuning.
+        counterexamples: latents of the whole domain at which the condition fails that each search adds to the batches of
+            the fine-tuning (0: off; the proof has not needed them so far).
         unsafe_margin: hinge margin on labelled unsafe latents.
         deviation_coeff: weight lambda_3 of the deviation from the user's policy (preset "paper").
         recovery_coeff: weight of the action that leads back, on latents outside the set.
@@ -143,6 +145,7 @@ class SynthesisConfig:
     band: float = 0.1
     batch: int = 1024
     lr: float = 1e-3
+    counterexamples: int = 0
     unsafe_margin: float = 0.05
     deviation_coeff: float = 0.01
     recovery_coeff: float = 0.3

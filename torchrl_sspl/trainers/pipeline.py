@@ -22,6 +22,7 @@ from torch import Tensor, nn
 from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
+from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError
@@ -44,6 +45,7 @@ from torchrl_sspl.trainers.evaluation import encode_states, rollout
 
 CHECKPOINT_FILE = "checkpoint.pt"
 _ENCODE_CHUNK = 1000
+_SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
 
 
@@ -146,6 +148,7 @@ class SafePolicyTraining:
         ).to(self.device)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.latents: dict[str, Tensor] = {}
+        self.counterexamples = torch.zeros(0, net.latent_dim)
         self.best: dict[str, Any] | None = None
         self.checks: list[Check] = []
         self.phase, self.step, self.seconds = 0, 0, 0.0
@@ -493,11 +496,34 @@ class SafePolicyTraining:
             )
             asked = rim[self._pick(len(rim), 3 * s.batch // 2)]
             error = asked["residual"][torch.arange(len(asked)), self._pick(s.residuals, len(asked))]
-            terms = synthesis(asked.exclude("residual").set("residual", error))
+            asked = asked.exclude("residual").set("residual", error)
+            if s.counterexamples:
+                asked = self._with_counterexamples(asked)
+            terms = synthesis(asked)
             terms.update(target(table[rows]))
             return terms
 
         self._loop(steps, networks, step)
+
+    def _with_counterexamples(self, asked: TensorDict) -> TensorDict:
+        """Adds latents of the whole domain at which the condition fails; they are searched for again and again."""
+        s, net = self.config.synthesis, self.config.network
+        if self.step % _SEARCH_EVERY == 0:
+            system = closed_loop(
+                self.barrier,
+                self.dynamics,
+                self.policy,
+                latent_dim=net.latent_dim,
+                lipschitz_bound=net.lipschitz_bound,
+            )
+            found = find_counterexamples(system, s.counterexamples, margin=s.margin, generator=self.generator)
+            known = found if self.step == 0 else torch.cat([found, self.counterexamples])
+            self.counterexamples = known[: 8 * s.counterexamples]
+        if not len(self.counterexamples):
+            return asked
+        latent = self.counterexamples[self._pick(len(self.counterexamples), len(asked) // 4)]
+        hard = TensorDict(latent=latent, residual=torch.zeros_like(latent), batch_size=[len(latent)])
+        return torch.cat([asked, hard])
 
     @torch.no_grad()
     def _phase_check(self, number: int) -> None:
@@ -742,6 +768,7 @@ class SafePolicyTraining:
             "seconds": self.seconds,
             "networks": self.networks.state_dict(),
             "latents": self.latents,
+            "counterexamples": self.counterexamples,
             "best": self.best,
             "checks": [vars(c) for c in self.checks],
             "generator": self.generator.get_state(),
@@ -773,6 +800,7 @@ class SafePolicyTraining:
             )
         self.networks.load_state_dict(body["networks"])
         self.latents, self.best = body["latents"], body["best"]
+        self.counterexamples = body["counterexamples"]
         self.checks = [Check(**c) for c in body["checks"]]
         self.generator.set_state(body["generator"])
         self.phase, self.step, self.seconds = body["phase"], body["step"], body["seconds"]
