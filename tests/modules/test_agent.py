@@ -138,7 +138,7 @@ def test_weights_that_are_not_finite_are_named(saved, value):
 @pytest.mark.parametrize("part", ["encoder", "dynamics", "policy"])
 def test_unknown_network_class_lists_the_known_ones(saved, part):
     edit(saved, lambda body: body["networks"][part].update({"class": "Transformer"}))
-    with pytest.raises(CheckpointError, match=rf"\['{NETWORKS[part]['class']}'\], received 'Transformer'.*registries"):
+    with pytest.raises(CheckpointError, match=rf"'{NETWORKS[part]['class']}'.*\], received 'Transformer'.*registries"):
         Agent.load(saved)
 
 
