@@ -43,13 +43,16 @@ SUMMARY = (
 
 
 class ExploringPolicy(TensorDictModuleBase):
-    """Rollout policy that explores: noise on its actions, and now and then a random action instead.
+    """Rollout policy that explores: noise on its actions, and random actions in some of the environments.
+
+    Whole episodes are random or follow the policy: what the policy leads to, such as standing still, is not seen when
+    every other action is random.
 
     Args:
         policy: pixels -> ``"action"``.
         low, high: bounds of the action ``(action_dim,)``.
         exploration: standard deviation of the noise, as a share of the half range.
-        random_share: share of steps with a uniformly random action.
+        random_share: share of the environments with uniformly random actions; of a single one, share of the steps.
 
     Source: none.
     """
@@ -73,7 +76,11 @@ class ExploringPolicy(TensorDictModuleBase):
         half = (self.high - self.low) / 2
         noisy = action + self.exploration * half * torch.randn_like(action)
         uniform = self.low + (self.high - self.low) * torch.rand_like(action)
-        swap = torch.rand_like(action[..., :1]) < self.random_share
+        n = action.shape[0] if action.ndim > 1 else 1
+        if n > 1:
+            swap = (torch.arange(n, device=action.device) < round(self.random_share * n)).reshape(-1, *[1] * (action.ndim - 1))
+        else:
+            swap = torch.rand_like(action[..., :1]) < self.random_share
         return tensordict.set("action", torch.where(swap, uniform, noisy.clamp(self.low, self.high)))
 
 

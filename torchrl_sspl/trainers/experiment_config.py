@@ -130,7 +130,7 @@ class CollectorConfig:
         frames_per_batch: transitions per batch, over all collectors.
         init_random_frames: transitions under random actions before learning starts.
         exploration: standard deviation of the noise on the policy's actions, as a share of the largest action.
-        random_share: share of steps with a random action instead.
+        random_share: share of the environments that act at random all the time.
         ray_address: address of a running Ray cluster; "" starts a local one.
     """
 
