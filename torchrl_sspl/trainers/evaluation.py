@@ -137,18 +137,20 @@ class _Observer:
         self.memory = self._see(previous)
         return self.next(state)
 
-    def next(self, state: Tensor) -> Tensor:
+    def next(self, state: Tensor, rows: Tensor | slice = slice(None)) -> Tensor:
+        """Latents of the states ``(k, state_dim)`` of k of the episodes, by default of all."""
         seen = self._see(state)
+        memory = self.memory[rows]
         if self.split:
-            latent = self.agent.encoder.head(self.memory, seen)  # type: ignore[operator, union-attr]
+            latent = self.agent.encoder.head(memory, seen)  # type: ignore[operator, union-attr]
         else:
             latent = torch.cat(
                 [
                     self.agent.encode(torch.cat([a, b], dim=-3))
-                    for a, b in zip(self.memory.split(_CHUNK), seen.split(_CHUNK), strict=True)
+                    for a, b in zip(memory.split(_CHUNK), seen.split(_CHUNK), strict=True)
                 ]
             )
-        self.memory = seen
+        self.memory[rows] = seen
         return latent
 
 
@@ -213,7 +215,13 @@ def rollout(
             moved = torch.where(env.state_space.contains(state)[:, None], moved, state)
         state = moved
         predicted = agent.dynamics(latent, action)
-        latent = observer.next(state)
+        if exit_is_safe:
+            # Nobody looks at whoever is gone.
+            here = env.state_space.contains(state).nonzero()[:, 0]
+            if len(here):
+                latent = latent.index_copy(0, here, observer.next(state[here], here))
+        else:
+            latent = observer.next(state)
         value = agent.barrier(latent)[:, 0]
         error, barrier_error = (predicted - latent).norm(dim=-1), value - agent.barrier(predicted)[:, 0]
         if exit_is_safe:
