@@ -55,7 +55,7 @@ def definitions(path: Path) -> list[str]:
     """Public functions and classes that a file defines at its top level."""
     body = ast.parse(path.read_text()).body
     kinds = (ast.FunctionDef, ast.ClassDef)
-    return [node.name for node in body if isinstance(node, kinds) and not node.name.startswith("_")]
+    return [node.name for node in body if isinstance(node, kinds) and not node.name.startswith("_") and node.name != "main"]
 
 
 def exported(path: Path) -> list[str]:
@@ -107,7 +107,7 @@ def anchor(name: str) -> str:
 def api_index() -> str:
     """The names of ``import torchrl_sspl`` on one page."""
     lines = ["# API", "", "`import torchrl_sspl as sspl` is light: every name is loaded when it is first used.", ""]
-    lines += ["| Name | |", "|---|---|"]
+    lines += ["| Name | Is |", "|---|---|"]
     for name, target in sorted(top_level().items(), key=lambda item: item[0].lower()):
         lines.append(f"| {anchor(name)}[`sspl.{name}`][{target}] | {summary(target)} |")
     for part in parts():
