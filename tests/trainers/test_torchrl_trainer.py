@@ -248,6 +248,8 @@ def test_wrong_arguments_are_named() -> None:
         EveryHook(None, dict, every=0)
     with pytest.raises(ConfigError, match=r"keys \['a'\], received \['b'\]"):
         EveryHook(None, lambda trainer: {"b": 1.0}, names=("a",))(None)
+    with pytest.raises(ConfigError, match="weights of actor_network alone"):
+        build(learner_backend="ray")
     trainer = build()
     with pytest.raises(ConfigError, match="checkpoint_dir"):
         trainer.resume()

@@ -120,6 +120,12 @@ class SSPLTrainer(Trainer):
             raise ConfigError(
                 f"expected loss_module to be an SSPLLoss, received {type(loss_module).__name__}"
             )
+        if trainer_options.get("learner_backend", "local") != "local":
+            raise ConfigError(
+                f"expected learner_backend='local', received {trainer_options['learner_backend']!r}; TorchRL's remote learner "
+                "sends collectors the weights of actor_network alone, and a policy from pixels needs those of the encoder "
+                "too; put the collectors on Ray instead"
+            )
         delayed = any(name.startswith("target_") for name, _ in loss_module.named_children())
         if target_net_updater is not None and not delayed:
             raise ConfigError(
