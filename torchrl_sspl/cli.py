@@ -108,6 +108,7 @@ def train(words: list[str]) -> int:
 def _train_rounds(config: Any) -> int:
     from torchrl_sspl.envs.base import SafetyEnv
     from torchrl_sspl.trainers.experiment_config import EnvFactory
+    from torchrl_sspl.trainers.loggers import close_logger, make_logger
     from torchrl_sspl.trainers.requirements import PENDULUM
     from torchrl_sspl.trainers.run import run
 
@@ -130,7 +131,11 @@ def _train_rounds(config: Any) -> int:
             "action": "torque [N m]",
             "foreign": lambda env: lambda state: env.observe_gymnasium(state)[:, 3:],
         }
-    outcome = run(config.trainer, make, title=f"{type(env).__name__} from pixels", **own)
+    logger = make_logger(
+        config.logger.kind, config.logger.kind, config.trainer.out_dir, project=getattr(config.logger, "project", "torchrl-sspl")
+    )
+    outcome = run(config.trainer, make, title=f"{type(env).__name__} from pixels", logger=logger, **own)
+    close_logger(logger)
     print(outcome.summary() if own else f"training: {outcome.training.stop_reason}")
     print(f"report: {outcome.report}")
     return 0

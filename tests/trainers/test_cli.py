@@ -105,6 +105,9 @@ def test_rounds_through_the_command(tmp_path, capsys):
     words += [f"trainer.evaluation.{w}" for w in sizes]
     assert cli.main(["train", "trainer=rounds_smoke", *words, f"out_dir={tmp_path}"]) == 0, capsys.readouterr().err
     assert (tmp_path / "report.html").stat().st_size > 0
+    steps = [line.split(",")[0] for line in (tmp_path / "csv/scalars/loss_consistency.csv").read_text().splitlines()]
+    assert steps == sorted(steps, key=float)
+    assert (tmp_path / "csv/scalars/inside_of_allowed.csv").is_file()
     assert json.loads((tmp_path / "metrics.json").read_text())["measurements"]["volume_over_kernel"]["n"] > 0
     assert cli.main(["evaluate", str(tmp_path), "rollouts=2"]) == 0
     assert "volume_over_kernel" in capsys.readouterr().out

@@ -42,6 +42,7 @@ from torchrl_sspl.objectives.target import TargetLoss
 from torchrl_sspl.sets import SAFE, UNSAFE, Region
 from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
+from torchrl_sspl.trainers.loggers import METRICS, log_scalars
 
 CHECKPOINT_FILE = "checkpoint.pt"
 _ENCODE_CHUNK = 1000
@@ -176,6 +177,8 @@ class SafePolicyTraining:
             "pool_to": net.pool_to,
             "velocity_gain": net.velocity_gain,
         }
+
+    logger: Any = None  # of TorchRL; gets the numbers that go to log.jsonl
 
     def _new_barrier(self) -> SandwichBarrier:
         net = self.config.network
@@ -755,6 +758,8 @@ class SafePolicyTraining:
         name, number = phases[min(self.phase, len(phases) - 1)]
         with (self.out_dir / "log.jsonl").open("a") as file:
             file.write(json.dumps({"phase": name, "round": number, **row}) + "\n")
+        done = sum(self._size(phase) for phase, _ in phases[: self.phase]) + self.step
+        log_scalars(self.logger, {k: v for k, v in row.items() if k in METRICS}, done)
 
     def _checkpoint(self) -> None:
         """Write the state of the training; the old one stays until the new one is complete."""

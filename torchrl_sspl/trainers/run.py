@@ -74,7 +74,11 @@ class RunOutcome:
 
 
 def train(
-    config: TrainingConfig, make_env: Callable[[list[int], int], SafetyEnv], *, resume: bool = True
+    config: TrainingConfig,
+    make_env: Callable[[list[int], int], SafetyEnv],
+    *,
+    resume: bool = True,
+    logger: Any = None,
 ) -> TrainingResult:
     """Train an agent as the configuration's preset says.
 
@@ -82,6 +86,7 @@ def train(
         config: everything that determines the training.
         make_env: ``(batch_size, seed) -> environment``.
         resume: continue from the checkpoint in ``config.out_dir`` if there is one.
+        logger: TorchRL logger that gets the numbers of ``log.jsonl`` too.
 
     Returns:
         The agent with the checks of all rounds.
@@ -89,7 +94,9 @@ def train(
     Source: paper Algorithm 1.
     """
     kind = PaperTraining if config.preset == "paper" else SafePolicyTraining
-    return kind(config, make_env, resume=resume).run()
+    training = kind(config, make_env, resume=resume)
+    training.logger = logger
+    return training.run()
 
 
 def run(
@@ -101,6 +108,7 @@ def run(
     foreign: Callable[[SafetyEnv], Draw] | None = None,
     axes: tuple[str, str] = ("x0", "x1"),
     action: str = "action",
+    logger: Any = None,
 ) -> RunOutcome:
     """Train, evaluate and report; everything lands in ``config.out_dir``.
 
@@ -112,6 +120,7 @@ def run(
         foreign: environment -> renderer ``(n, state_dim) -> (n, 3, H, W)`` other than its own, to evaluate on too.
         axes: names and units of the two state coordinates that figures show.
         action: name and unit of the action.
+        logger: TorchRL logger that gets the numbers of ``log.jsonl`` too.
 
     Returns:
         The outcome; ``metrics.json``, ``figures/``, ``report.html`` and ``agent/`` (with ``certificate.json``) are on disk.
@@ -119,7 +128,7 @@ def run(
     Source: none.
     """
     directory = Path(config.out_dir)
-    training = train(config, make_env)
+    training = train(config, make_env, logger=logger)
     env = make_env([1], config.seed)
     own, other = assess(training.agent, env, config.evaluation, foreign, progress=config.progress)
     certificate = certify(
