@@ -13,7 +13,17 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+import gymnasium
+
 __version__ = "0.1.0"
+
+# A name and a path: nothing of the simulator is loaded before the environment is made.
+if "SSPL/QuadrupedObstacle-v0" not in gymnasium.registry:
+    gymnasium.register(
+        id="SSPL/QuadrupedObstacle-v0",
+        entry_point="torchrl_sspl.envs.quadruped.env:QuadrupedEnv",
+        max_episode_steps=80,
+    )
 
 _SUBPACKAGES = ("certification", "data", "envs", "errors", "functional", "lipschitz", "modules", "objectives", "sets", "trainers", "viz")
 _NAMES = {

@@ -1,0 +1,240 @@
+"""The walking robot among obstacles, in full physics, as a gymnasium environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from torchrl_sspl.envs.quadruped.camera import TopCamera
+from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
+from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
+from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+
+_RENDER_SIZE = 512
+
+
+class QuadrupedEnv(gymnasium.Env):
+    r"""A Unitree A1 that walks at constant speed and is told its yaw rate; seen from above in two frames.
+
+    The robot is simulated with its convex MPC in PyBullet; feet and body collide with the obstacle. An episode ends when
+    the robot falls or leaves the arena, which counts as safe. Every entry of ``info`` is about the present step:
+
+    ============= ===========================================================================================
+    ``pose``      (x, y, heading) of the base [m, m, rad], float64 ``(3,)``
+    ``unsafe``    the base is in U
+    ``safe``      the base is in S
+    ``contact``   a foot or the body has touched the obstacle during the step
+    ``fallen``    the base is below 0.15 m or tilted by more than 0.8 rad
+    ``left``      the base is outside the arena
+    ``cost``      1 if unsafe or contact or fallen, else 0
+    ============= ===========================================================================================
+
+    Args:
+        max_yaw_rate: bound of the action, rad/s; what lies beyond is clipped.
+        speed: forward velocity, m/s.
+        dt: time of one step, s.
+        image_size: height and width of the frames, pixels.
+        arena_half_size: half of the arena's edge, m.
+        safe_half_size: S lies outside the square of this half edge around the obstacle, m.
+        unsafe_half_size: half edge, or radius, of U around the obstacle, m.
+        obstacle_shape: "square" or "disc".
+        obstacle_half_size: half edge, or radius, of the obstacle itself, m. Feet reach 0.35 m from the base: up to 0.3 m
+            nothing touches it while the base is outside U.
+        obstacle_centre: (x, y), m.
+        meshes: draw the robot's meshes (thirty times slower); agents are trained on the plain shapes.
+        render_mode: "rgb_array", "human" (a window) or None.
+
+    Raises:
+        MissingDependencyError: PyBullet, its data or daqp is missing.
+        ConfigError: a parameter is not valid, or a window is asked for where there is no display.
+
+    Source: paper, Section IV-B. Deviation: leaving the arena is defined; yaw rates are slew limited in the controller.
+
+    Example:
+        >>> env = QuadrupedEnv()  # doctest: +SKIP
+        >>> pixels, info = env.reset(options={"pose": [-1.8, 0.0, 0.0]})  # doctest: +SKIP
+        >>> pixels, reward, terminated, truncated, info = env.step(np.array([0.5]))  # doctest: +SKIP
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # type: ignore[misc]
+    _gait: ClassVar[list[Snapshot]] = []
+
+    def __init__(
+        self,
+        max_yaw_rate: float = 2.0,
+        *,
+        speed: float = 1.0,
+        dt: float = 0.1,
+        image_size: int = 128,
+        arena_half_size: float = 2.0,
+        safe_half_size: float = 1.5,
+        unsafe_half_size: float = 0.7,
+        obstacle_shape: str = "square",
+        obstacle_half_size: float = 0.3,
+        obstacle_centre: Sequence[float] = (0.0, 0.0),
+        meshes: bool = False,
+        render_mode: str | None = None,
+    ) -> None:
+        numbers = {
+            "max_yaw_rate": max_yaw_rate,
+            "speed": speed,
+            "dt": dt,
+            "arena_half_size": arena_half_size,
+            "safe_half_size": safe_half_size,
+            "unsafe_half_size": unsafe_half_size,
+            "obstacle_half_size": obstacle_half_size,
+        }
+        for name, value in numbers.items():
+            if not math.isfinite(value) or value <= 0:
+                raise ConfigError(f"{name}: expected a positive finite number, received {value!r}.")
+        if not obstacle_half_size <= unsafe_half_size < safe_half_size:
+            raise ConfigError(
+                f"sizes: expected obstacle <= unsafe < safe, received {obstacle_half_size}, {unsafe_half_size}, {safe_half_size}."
+            )
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ConfigError(
+                f"render_mode: expected None or one of {self.metadata['render_modes']}, received {render_mode!r}."
+            )
+        self.max_yaw_rate, self.speed, self.dt = float(max_yaw_rate), float(speed), float(dt)
+        self.arena_half_size, self.safe_half_size, self.unsafe_half_size = arena_half_size, safe_half_size, unsafe_half_size
+        self.obstacle_shape, self.obstacle_centre = obstacle_shape, np.asarray(obstacle_centre, dtype=np.float64)
+        self.render_mode = render_mode
+        self._client = connect(gui=render_mode == "human")
+        self._robot = WalkingRobot(self._client, meshes=meshes)
+        if not QuadrupedEnv._gait:  # the same for every robot of the process; two seconds of simulation
+            QuadrupedEnv._gait = self._robot.steady_gait()
+        self._obstacle = add_obstacle(self._client, obstacle_shape, obstacle_half_size, self.obstacle_centre.tolist())
+        self._camera = TopCamera(self._client, image_size)
+        self._large = TopCamera(self._client, _RENDER_SIZE)
+        self._substeps = max(1, round(dt / self._robot.dt))
+        self._frames: NDArray[np.uint8] | None = None
+        # The simulator remembers contacts: every episode starts from one and the same memory.
+        self._robot.place(self._gait[0], 0.0, -self.safe_half_size, 0.0)
+        self._walk(0.0)
+        self._memory = self._client.saveState()
+        self.observation_space = gymnasium.spaces.Box(0, 255, (6, image_size, image_size), np.uint8)
+        self.action_space = gymnasium.spaces.Box(-self.max_yaw_rate, self.max_yaw_rate, (1,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
+        """Start an episode: the robot walks straight ahead, in a steady gait, at a pose.
+
+        Args:
+            seed: of the starts.
+            options: "pose", (x, y, heading) [m, m, rad]; default uniform in S. "phase", of the gait in [0, 1);
+                default uniform.
+
+        Returns:
+            Frames uint8 ``(6, H, W)``, one step ago and now; info.
+
+        Raises:
+            ConfigError: an option is not known.
+            ShapeError, NonFiniteError: the pose is not three finite numbers.
+        """
+        super().reset(seed=seed)
+        given = dict(options or {})
+        pose = given.pop("pose", None)
+        phase = float(given.pop("phase", self.np_random.random()))
+        if given:
+            raise ConfigError(f"options: expected 'pose' and 'phase', received {sorted(given)}.")
+        x, y, heading = self._start() if pose is None else _numbers("pose", pose, 3)
+        snapshot = self._gait[int(phase * len(self._gait)) % len(self._gait)]
+        self._client.restoreState(self._memory)
+        # The frame of one step ago is a real one: start a step earlier, and walk straight ahead.
+        back = self.speed * self.dt
+        self._robot.place(snapshot, x - back * math.cos(heading), y - back * math.sin(heading), heading)
+        before = self._capture()
+        contact = self._walk(0.0)
+        self._frames = np.concatenate([before, self._capture()])
+        return self._frames.copy(), self._info(contact)
+
+    def step(self, action: Any) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
+        """Walk for ``dt``.
+
+        Args:
+            action: yaw rate ``(1,)``, rad/s.
+
+        Returns:
+            Frames, reward (minus the cost), terminated (fallen, or left the arena), False, info.
+
+        Raises:
+            ShapeError, NonFiniteError: the action is not one finite number; the robot has not moved.
+            SolverError: the controller found no forces many times in a row.
+            ConfigError: the episode was not started.
+        """
+        if self._frames is None:
+            raise ConfigError("step: expected a reset before the first step, received none; call reset().")
+        (rate,) = _numbers("action", action, 1)
+        contact = self._walk(min(max(rate, -self.max_yaw_rate), self.max_yaw_rate))
+        info = self._info(contact)
+        now = self._frames[3:] if info["left"] and not self._seen() else self._capture()
+        self._frames = np.concatenate([self._frames[3:], now])
+        return self._frames.copy(), -info["cost"], info["fallen"] or info["left"], False, info
+
+    def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
+        """The top view, uint8 ``(512, 512, 3)``, in render mode "rgb_array"; a window follows by itself."""
+        return self._large.capture() if self.render_mode == "rgb_array" else None
+
+    def close(self) -> None:
+        """End the simulation; may be called more than once."""
+        if self._client is not None:
+            self._client.disconnect()
+            self._client = None
+
+    # -- parts ----------------------------------------------------------------------------------------------------------
+
+    def _walk(self, rate: float) -> bool:
+        """Simulate one step at a yaw rate; whether the obstacle was touched."""
+        contact = False
+        for _ in range(self._substeps):
+            self._robot.step([self.speed, 0.0, rate])
+            contact = contact or bool(self._client.getContactPoints(self._robot.body_id, self._obstacle))
+        return contact
+
+    def _start(self) -> tuple[float, float, float]:
+        """A pose, uniform in S."""
+        while True:
+            x, y = self.np_random.uniform(-self.arena_half_size, self.arena_half_size, 2)
+            if np.abs(np.array([x, y]) - self.obstacle_centre).max() >= self.safe_half_size:
+                return x, y, self.np_random.uniform(-math.pi, math.pi)
+
+    def _seen(self) -> bool:
+        """Whether the robot is in the view of the camera."""
+        return bool((self._camera.raw(self._camera.image_size)[1] == self._robot.body_id).any())
+
+    def _capture(self) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(self._camera.capture(self._robot.body_id).transpose(2, 0, 1))
+
+    def _info(self, contact: bool) -> dict[str, Any]:
+        pose = self._robot.pose
+        away = np.abs(pose[:2] - self.obstacle_centre)
+        distance = float(np.hypot(*away) if self.obstacle_shape == "disc" else away.max())
+        unsafe, fallen = distance <= self.unsafe_half_size, self._robot.fallen
+        return {
+            "pose": pose,
+            "unsafe": unsafe,
+            "safe": float(away.max()) >= self.safe_half_size,
+            "contact": contact,
+            "fallen": fallen,
+            "left": bool(np.abs(pose[:2]).max() > self.arena_half_size),
+            "cost": float(unsafe or contact or fallen),
+        }
+
+
+def _numbers(name: str, value: Any, n: int) -> list[float]:
+    """n finite numbers."""
+    array = np.asarray(value, dtype=np.float64).reshape(-1)
+    if array.shape != (n,):
+        raise ShapeError(f"{name}: expected {n} number(s), received shape {np.shape(value)}.")
+    if not np.isfinite(array).all():
+        raise NonFiniteError(f"{name}: expected finite numbers, received {array.tolist()}; check the policy's output.")
+    return array.tolist()
+
+
+__all__ = ["QuadrupedEnv"]
