@@ -82,9 +82,10 @@ def test_sdist_builds_the_same_package(built):
 @pytest.mark.slow
 def test_wheel_works_outside_the_checkout(built, tmp_path):
     """A fresh environment that borrows this one's dependencies; `make release-check` installs them, too."""
-    venv.create(tmp_path / "venv", with_pip=True)
+    venv.create(tmp_path / "venv", with_pip=False)
     python = tmp_path / "venv" / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "--quiet", "--no-deps", "--no-index", str(built[0])], check=True)
+    install = ["install", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-index", str(built[0])]
+    subprocess.run([sys.executable, "-m", "pip", "--python", str(python), *install], check=True)
     packages = next((tmp_path / "venv" / "lib").glob("python*/site-packages"))
     # A folder in a .pth file is searched last, and its own .pth files (an editable install) are not read.
     (packages / "borrowed.pth").write_text("\n".join(p for p in sys.path if p.endswith("site-packages")))
