@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -213,7 +214,8 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
         values[key] = value
     config: Any = EpisodesConfig(**experiment["evaluation"]) if experiment else EvaluationConfig()
     if not experiment and body.get("training", {}).get("evaluation"):
-        config = EvaluationConfig(**body["training"]["evaluation"])
+        known = {f.name for f in dataclasses.fields(EvaluationConfig)}  # another version may have had others
+        config = EvaluationConfig(**{k: v for k, v in body["training"]["evaluation"].items() if k in known})
     for key, value in values.items():
         _assign(config, key, value)
     if experiment:

@@ -101,7 +101,7 @@ def test_gymnasium_by_import_paths(tmp_path, capsys, monkeypatch):
 def test_rounds_through_the_command(tmp_path, capsys):
     pytest.importorskip("hydra")
     words = [f"trainer.{w}" for w in TINY if not w.startswith("preset")]
-    sizes = ["grid=9", "kernel_grid=61", "rollouts=4", "horizon=3", "gymnasium_rollouts=0"]
+    sizes = ["grid=9", "kernel_grid=61", "rollouts=4", "horizon=3", "gymnasium_rollouts=0", "certificate_episodes=20"]
     words += [f"trainer.evaluation.{w}" for w in sizes]
     assert cli.main(["train", "trainer=rounds_smoke", *words, f"out_dir={tmp_path}"]) == 0, capsys.readouterr().err
     assert (tmp_path / "report.html").stat().st_size > 0

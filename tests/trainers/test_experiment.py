@@ -1,0 +1,202 @@
+"""Experiments: exploration, episodes and what is counted on them, the level of the set, and going on after a stop."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium import spaces
+from tensordict import TensorDict
+from torch import nn
+
+from torchrl_sspl.envs.gymnasium import GymnasiumPixels
+from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.modules.agent import Agent, mlp_barrier
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+from torchrl_sspl.trainers.episodes import Episodes, evaluate_episodes, run_episodes, separating_level
+from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy
+from torchrl_sspl.trainers.experiment_config import EpisodesConfig, experiment_config
+
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
+
+
+class Lane(gymnasium.Env):
+    """A point at 0..15 moves by the action; beyond 12 the episode ends."""
+
+    render_mode = "rgb_array"
+    observation_space = spaces.Box(0, 20, (1,), np.float64)
+    action_space = spaces.Box(-3.0, 3.0, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.x = float(self.np_random.integers(1, (options or {}).get("below", 9)))
+        return np.array([self.x]), {}
+
+    def step(self, action):
+        self.x = float(np.clip(self.x + float(action[0]), 0, 15))
+        return np.array([self.x]), 0.0, self.x > 12, False, {}
+
+    def render(self):
+        picture = np.zeros((16, 16, 3), np.uint8)
+        picture[:, round(self.x)] = 255
+        return picture
+
+
+def lane(batch_size=(4,), seed=0, **options) -> GymnasiumPixels:
+    sets = {"safe": lambda state, info: state[0] < 3, "unsafe": lambda state, info: state[0] > 10}
+    return GymnasiumPixels(Lane, batch_size=batch_size, seed=seed, image_size=16, **sets, **options)
+
+
+class Where(nn.Module):
+    """Latent (x, 0) / 16, read from the second frame."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = nn.Parameter(torch.ones(1))
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        x = pixels[..., 3, 0, :].float().argmax(-1, keepdim=True) / 16
+        return torch.cat([self.scale * x, torch.zeros_like(x)], -1)
+
+
+class Move(nn.Module):
+    def forward(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
+        return latent + torch.cat([action, torch.zeros_like(action)], -1) / 16
+
+
+class Push(nn.Module):
+    def __init__(self, by: float) -> None:
+        super().__init__()
+        self.by = by
+
+    def forward(self, latent: torch.Tensor) -> torch.Tensor:
+        return torch.full_like(latent[..., :1], self.by)
+
+
+def agent(by: float, border: float = 9.4) -> Agent:
+    """B = (x - border) / 16, and a policy that always moves by the same."""
+    barrier = mlp_barrier(2, [])
+    with torch.no_grad():
+        barrier[0].weight.copy_(torch.tensor([[1.0, 0.0]]))
+        barrier[0].bias.fill_(-border / 16)
+    return Agent(Where(), Move(), barrier, Push(by), 2.0)
+
+
+def test_episodes_end_where_the_system_ends_them():
+    episodes = run_episodes(agent(3.0), lane((3,)), 5, horizon=8)
+    assert episodes.barrier.shape == (9, 5)
+    x = episodes.latent[..., 0] * 16
+    for k in range(5):
+        life = int(episodes.alive[:, k].sum())
+        assert episodes.alive[:life, k].all()
+        path = x[:life, k]
+        assert torch.allclose(path.diff().clamp_max(3.0), path.diff())
+        assert (path[:-1] <= 12).all()
+        assert path[-1] > 12
+    assert len(episodes.film) == int(episodes.alive[:, 0].sum())
+
+
+def test_prediction_errors_compare_with_what_was_seen():
+    episodes = run_episodes(agent(1.0), lane((4,)), 4, horizon=3)
+    assert episodes.prediction_error[episodes.alive[1:]].max() < 1e-5
+    off = agent(1.0)
+    off.dynamics = nn.Identity()
+    off.dynamics.forward = lambda latent, action: latent
+    wrong = run_episodes(off, lane((4,)), 4, horizon=3)
+    assert wrong.prediction_error[wrong.alive[1:]] == pytest.approx(1 / 16)
+
+
+def test_measurements_count_episodes():
+    sizes = EpisodesConfig(episodes=10, envs=5, horizon=8)
+    away = evaluate_episodes(agent(3.0), lane, sizes)
+    assert away["touch_unsafe"] == away["leave"] == 1.0  # every episode drives to the end
+    assert away.measurements["touch_unsafe"].n == 10
+    still = evaluate_episodes(agent(0.0), lane, sizes)
+    assert still["touch_unsafe"] == still["leave"] == 0.0
+    assert still["unsafe_called_safe"] in (None, 0.0)  # pictures show whole numbers, so the border lies at 9.5
+    loose = evaluate_episodes(agent(3.0, border=11.5), lane, sizes)
+    assert loose["unsafe_called_safe"] > 0.0
+    tight = evaluate_episodes(agent(3.0, border=0.5), lane, sizes)
+    assert tight["starts_inside"] == 0.0
+    assert tight["touch_unsafe"] is None
+    assert tight["safe_called_unsafe"] == 1.0
+
+
+def test_the_level_keeps_held_out_observations_of_U_outside():
+    def episodes(barrier, region, alive=None):
+        value = torch.tensor(barrier)[:, None]
+        kept = torch.ones_like(value, dtype=torch.bool) if alive is None else torch.tensor(alive)[:, None]
+        codes = torch.tensor(region)[:, None]
+        return Episodes(value[..., None], value, codes, kept, value[1:], torch.zeros(1))
+
+    assert separating_level([episodes([-0.3, 0.5], [SAFE, UNSAFE])], 0.02) == 0.0  # never raised
+    assert separating_level([episodes([-0.3, -0.1], [SAFE, UNSAFE])], 0.02) == pytest.approx(-0.12)
+    assert separating_level([episodes([-0.3, -0.1], [SAFE, UNSAFE], [True, False])], 0.02) == 0.0
+    assert separating_level([episodes([-0.3, -0.1], [SAFE, UNLABELLED])], 0.02) == 0.0
+
+
+def test_exploration_is_random_in_its_share_of_the_environments():
+    policy = nn.Identity()
+    policy.forward = lambda td: td.set("action", torch.zeros(*td.shape, 1))
+    explore = ExploringPolicy(policy, torch.tensor([-2.0]), torch.tensor([2.0]), exploration=0.0, random_share=0.5)
+    actions = torch.stack([explore(TensorDict(pixels=torch.zeros(4, 1), batch_size=4))["action"] for _ in range(50)])
+    assert (actions[:, 2:] == 0).all()
+    assert actions[:, :2].std() > 0.8
+    assert actions.abs().max() <= 2.0
+    noisy = ExploringPolicy(policy, torch.tensor([-2.0]), torch.tensor([2.0]), exploration=0.1, random_share=0.0)
+    actions = torch.stack([noisy(TensorDict(pixels=torch.zeros(4, 1), batch_size=4))["action"] for _ in range(200)])
+    assert actions.std() == pytest.approx(0.2, rel=0.2)
+    alone = ExploringPolicy(policy, torch.tensor([-2.0]), torch.tensor([2.0]), exploration=0.0, random_share=0.5)
+    actions = torch.stack([alone(TensorDict(pixels=torch.zeros(1, 1), batch_size=1))["action"] for _ in range(200)])
+    assert (actions == 0).float().mean() == pytest.approx(0.5, abs=0.15)
+
+
+SMALL = [
+    "trainer.optim_steps_per_batch=2", "trainer.warm_start_steps=1", "trainer.progress=false", "trainer.checkpoint_every=0",
+    "collector.frames_per_batch=64", "collector.envs=8", "collector.init_random_frames=64", "network.pool_to=8",
+    "network.barrier_hidden=[8]", "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "buffer.batch=16",
+    "evaluation.episodes=4", "evaluation.envs=4", "evaluation.horizon=4",
+]  # fmt: skip
+
+
+def everywhere(batch_size, seed) -> GymnasiumPixels:
+    return lane(batch_size, seed, reset_options={"below": 13})
+
+
+def build(folder, *more: str) -> Experiment:
+    return Experiment(experiment_config([*SMALL, *more, f"out_dir={folder}"], **{"logger.kind": "none"}), everywhere)
+
+
+def test_a_stopped_experiment_goes_on_to_the_same_agent(tmp_path):
+    straight = build(tmp_path / "straight", "trainer.total_frames=256").train()
+    build(tmp_path / "stopped", "trainer.total_frames=128").train()
+    second = build(tmp_path / "stopped", "trainer.total_frames=256")
+    weights = second.train().state_dict()
+    assert second.trainer.collected_frames == 256
+    for name, value in straight.state_dict().items():
+        assert torch.equal(value, weights[name]), name
+
+
+def test_a_finished_experiment_is_not_trained_again_and_another_one_is_refused(tmp_path):
+    first = build(tmp_path, "trainer.total_frames=128").train().state_dict()
+    again = build(tmp_path, "trainer.total_frames=128")
+    weights = again.train().state_dict()
+    assert again.trainer.optimization_stepper.count == 2 * 2
+    assert all(torch.equal(value, weights[name]) for name, value in first.items())
+    other = build(tmp_path, "trainer.total_frames=128", "network.barrier_hidden=[16]")
+    with pytest.raises(CheckpointError, match="checkpoint of this trainer"):
+        other.train()
+    other.trainer.collector.shutdown()
+
+
+def test_environments_without_labels_are_refused(tmp_path):
+    from torchrl_sspl.envs import PendulumEnv
+
+    def unlabelled(batch_size, seed):
+        env = PendulumEnv(batch_size=batch_size, seed=seed, image_size=16)
+        del env.observation_spec["region"]
+        return env
+
+    with pytest.raises(ConfigError, match=r"keys pixels and region, found no \['region'\]"):
+        Experiment(experiment_config([*SMALL, f"out_dir={tmp_path}"]), unlabelled)
