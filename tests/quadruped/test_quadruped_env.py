@@ -38,7 +38,7 @@ def test_start_is_where_it_was_asked_for_and_frames_agree_with_the_model(env):
     drawn = model.observe(torch.as_tensor(info["pose"], dtype=torch.float32)[None])[0, 3:]
     differs = (drawn.int() - torch.as_tensor(pixels[3:]).int()).abs().amax(0) > 60
     assert float(differs.float().mean()) < 0.006  # legs in another phase: some dozen pixels
-    assert not (info["unsafe"] or info["contact"] or info["fallen"] or info["left"])
+    assert not any(info[name] for name in ("unsafe", "contact", "fallen", "left"))
 
 
 def test_walks_a_metre_a_second_and_turns_as_told(env):
@@ -148,11 +148,15 @@ def test_camera_that_does_not_see_the_robot_says_so(env):
         away.capture(env._robot.body_id)
 
 
+def walk(robot: WalkingRobot, steps: int) -> None:
+    for _ in range(steps):
+        robot.step([1.0, 0.0, 0.0])
+
+
 def test_unsolved_programs_fall_back_for_a_while_and_then_raise():
     client = world.connect()
     robot = WalkingRobot(client, solver=lambda hessian, *_: (np.zeros(len(hessian)), -1))
     with pytest.raises(SolverError):
-        for _ in range(2000):
-            robot.step([1.0, 0.0, 0.0])
+        walk(robot, 2000)
     assert robot.controller.failures > 1
     client.disconnect()

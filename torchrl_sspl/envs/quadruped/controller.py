@@ -11,6 +11,7 @@ from torchrl_sspl.envs.quadruped.kinematics import (
     SHOULDER,
     TOE_RADIUS,
     Array,
+    Mask,
     forward_kinematics,
     inverse_kinematics,
     rotation_z,
@@ -79,7 +80,7 @@ class Memory:
     forces: Array
     footholds: Array
     lift_off: Array
-    standing: Array
+    standing: Mask
 
     def moved(self, angle: float, shift: Array) -> Memory:
         """The same after a turn by an angle in rad about the vertical through the origin, then a shift in m."""
@@ -250,7 +251,7 @@ class WalkingController:
 
         # Feet seen from the centre of mass of the reference at the beginning of each step: those that stand stay
         # where they are until they are lifted, those that swing land on their footholds, later ones are nominal.
-        times = now + dt * np.arange(steps) + 0.5 * self.dt
+        times = np.asarray(now + dt * np.arange(steps) + 0.5 * self.dt, dtype=np.float64)
         phases = trot.phases(times)
         contacts = phases < trot.duty
         before = np.vstack([np.zeros(3), reference[:-1, 3:6] * [1.0, 1.0, 0.0]])
@@ -283,7 +284,7 @@ def check_command(command: Array | list[float]) -> Array:
         >>> check_command([1.0, 0.0, 2.0])
         array([1., 0., 2.])
     """
-    array = np.asarray(command, dtype=np.float64)
+    array: Array = np.asarray(command, dtype=np.float64)
     if array.shape != (3,):
         raise ShapeError(f"command: expected shape (3,), (m/s, m/s, rad/s), received {array.shape}.")
     if not np.isfinite(array).all():
@@ -294,7 +295,7 @@ def check_command(command: Array | list[float]) -> Array:
 def _solve(jacobians: Array, velocities: Array) -> Array:
     """Joint velocities ``(4, 3)`` for foot velocities; zero where a leg is singular."""
     try:
-        return np.linalg.solve(jacobians, velocities[..., None])[..., 0]
+        return np.asarray(np.linalg.solve(jacobians, velocities[..., None])[..., 0], dtype=np.float64)
     except np.linalg.LinAlgError:
         return np.zeros((4, 3))
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
 LEGS = ("FR", "FL", "RR", "RL")
 SIDE = np.array([-1.0, 1.0, -1.0, 1.0])

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from torchrl_sspl.envs.quadruped.gait import GRAVITY
-from torchrl_sspl.envs.quadruped.kinematics import Array, skew
+from torchrl_sspl.envs.quadruped.kinematics import Array, Mask, skew
 from torchrl_sspl.errors import MissingDependencyError, NonFiniteError, SolverError
 
 Solver = Callable[[Array, Array, Array, Array, Array], tuple[Array, int]]
@@ -120,7 +120,7 @@ class ConvexMPC:
         """Start anew from forces ``(4, 3)`` in N that are held if the first solution fails."""
         self._last, self._in_a_row = forces.copy(), 0
 
-    def solve(self, state: Array, reference: Array, feet: Array, contacts: Array) -> Array:
+    def solve(self, state: Array, reference: Array, feet: Array, contacts: Mask) -> Array:
         """Forces on the feet until the next call.
 
         Args:
@@ -164,7 +164,7 @@ class ConvexMPC:
             )
         return np.where(contacts[0][:, None], self._last, 0.0)
 
-    def build(self, state: Array, reference: Array, feet: Array, contacts: Array) -> tuple[Array, Array]:
+    def build(self, state: Array, reference: Array, feet: Array, contacts: Mask) -> tuple[Array, Array]:
         """Hessian ``(n, n)`` and gradient ``(n,)`` of the program in the n = 3 x (standing feet) forces."""
         steps, dt = self.horizon, self.dt
         step, foot = np.nonzero(contacts)

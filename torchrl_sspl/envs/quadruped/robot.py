@@ -41,6 +41,7 @@ class WalkingRobot:
 
     def __init__(self, client: Any, *, dt: float = 0.002, solver: Solver = solve_daqp, meshes: bool = False) -> None:
         self.client, self.dt = client, dt
+        self.measured: Measurement
         client.setGravity(0, 0, -GRAVITY)
         client.setTimeStep(dt)
         client.setPhysicsEngineParameter(numSolverIterations=30, enableConeFriction=0)
@@ -138,7 +139,7 @@ class WalkingRobot:
 
     def _set_standing(self, x: float = 0.0, y: float = 0.0, heading: float = 0.0, centre: float = 0.0) -> None:
         height = 0.28
-        feet = SHOULDER + [centre, 0.0, TOE_RADIUS - height]  # the centre of mass above the middle of the feet
+        feet = SHOULDER + np.array([centre, 0.0, TOE_RADIUS - height])  # the centre of mass above the middle of the feet
         still = np.zeros(3)
         position = np.array([x, y, height])
         joints = inverse_kinematics(feet)
