@@ -65,6 +65,15 @@ def test_from_the_simulator_to_the_report(name, tmp_path, monkeypatch):
     assert again["starts_inside"] == outcome.evaluation["starts_inside"]
 
 
+def test_the_program_of_the_page_is_one():
+    page = (EXAMPLES.parent / "docs" / "bring_your_own.md").read_text()
+    names: dict = {"__name__": "page"}
+    exec(page.split("```python\n")[1].split("```")[0], names)
+    env = names["my_env"](batch_size=[1], seed=0)
+    assert env.reset()["pixels"].shape == (1, 6, 64, 64)
+    env.close()
+
+
 def test_the_same_seed_gives_the_same_agent(tmp_path):
     module = example("bring_your_own_cartpole.py")
     runs = [run_experiment(module.my_env, TINY, out_dir=str(tmp_path / k)) for k in "ab"]
