@@ -146,19 +146,24 @@ def api_page(part: str) -> str:
 # ------------------------------------------------------------------ gallery
 
 
+def captions() -> dict[str, dict[str, str]]:
+    return tomllib.loads((ROOT / "docs" / "images" / "captions.toml").read_text())
+
+
 def examples() -> list[Path]:
-    return sorted((ROOT / "examples").glob("[!_]*.py"))
+    order = list(captions()["titles"])
+    paths = (ROOT / "examples").glob("[!_]*.py")
+    return sorted(paths, key=lambda path: (order.index(path.stem) if path.stem in order else len(order), path.stem))
 
 
 def gallery_title(path: Path) -> str:
-    """First phrase of an example's docstring."""
     first = (ast.get_docstring(ast.parse(path.read_text())) or path.stem).split("\n")[0]
-    return re.split(r"[:.,;](?:\s|$)", first)[0]
+    return captions()["titles"].get(path.stem) or re.split(r"[:.,;](?:\s|$)", first)[0]
 
 
 def gallery_pictures(path: Path) -> dict[str, str]:
     """Pictures of an example and their captions."""
-    return tomllib.loads((ROOT / "docs" / "images" / "captions.toml").read_text()).get(path.stem, {})
+    return captions().get(path.stem, {})
 
 
 def gallery_page(path: Path) -> str:
