@@ -7,15 +7,18 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
+from tiny import TINY as SMOKE
 
 from torchrl_sspl.data import TransitionStore, collect_random
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.lipschitz import SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy
 from torchrl_sspl.objectives import SSPLLoss
+from torchrl_sspl.trainers.config import make_config
 from torchrl_sspl.trainers.episodes import evaluate_episodes
 from torchrl_sspl.trainers.experiment import Experiment
 from torchrl_sspl.trainers.experiment_config import EnvFactory, EpisodesConfig, experiment_config
+from torchrl_sspl.trainers.pipeline import SafePolicyTraining
 
 pytestmark = [
     pytest.mark.gpu,
@@ -85,6 +88,21 @@ def test_experiments_train_on_the_gpu_and_return_an_agent_on_the_cpu(options, tm
     assert all(torch.isfinite(p).all() for p in experiment.loss.parameters())
     assert all(not p.is_cuda for p in outcome.agent.parameters())
     assert outcome.evaluation["starts_inside"] is not None
+
+
+def test_rounds_warm_up_on_the_gpu(tmp_path):
+    devices = []
+
+    class Watched(SafePolicyTraining):
+        def _mixed_batch(self, stores):
+            batch = super()._mixed_batch(stores)
+            devices.append(batch["frames"].device.type)
+            return batch
+
+    config = make_config([*SMOKE, "device=cuda", f"out_dir={tmp_path}"])
+    result = Watched(config, lambda n, seed: PendulumEnv(batch_size=n, seed=seed)).run()
+    assert set(devices) == {"cuda"}
+    assert all(not p.is_cuda for p in result.agent.parameters())
 
 
 def test_environment_on_the_gpu_draws_what_it_draws_on_the_cpu():

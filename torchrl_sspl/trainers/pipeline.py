@@ -211,11 +211,14 @@ class SafePolicyTraining:
         while self.phase < len(phases):
             name, number = phases[self.phase]
             self._bar.set_description(f"{name} {number}" if name != "represent" else name)
+            # Pixels are the work for a GPU; what follows are small networks on latents.
+            self.networks.to(self.device if name == "represent" else "cpu")
             getattr(self, f"_phase_{name}")(number)
             self._loop_state = None
             self.phase, self.step = self.phase + 1, 0
             self._checkpoint()
         self._bar.close()
+        self.networks.to("cpu")
         return self._result()
 
     def _size(self, name: str) -> int:
@@ -343,7 +346,7 @@ class SafePolicyTraining:
         mixed = self.config.representation.batch - 2 * labelled
         share = {"any": mixed // 2, "buffer": mixed - mixed // 2, "safe": labelled, "unsafe": labelled}
         batch = torch.cat([stores[k].sample(n, self.generator) for k, n in share.items()])
-        return batch.to(self.device)
+        return batch.to(next(self.encoder.parameters()).device)
 
     def _phase_gather(self, number: int) -> None:
         """Encoded transitions: random actions in the first round, the policy's own afterwards."""
