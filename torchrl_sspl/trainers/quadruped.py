@@ -159,7 +159,15 @@ def latency(agent: Agent, env: DubinsEnv, frames: int = 400) -> Measurement:
 
 
 @torch.no_grad()
-def walk(agent: Agent, env: Any, start: Sequence[float], steps: int, *, keep_frames: bool = False) -> Walk:
+def walk(
+    agent: Agent,
+    env: Any,
+    start: Sequence[float],
+    steps: int,
+    *,
+    seed: int | None = None,
+    keep_frames: bool = False,
+) -> Walk:
     """Let the robot walk in full physics under the agent's policy.
 
     Args:
@@ -167,6 +175,7 @@ def walk(agent: Agent, env: Any, start: Sequence[float], steps: int, *, keep_fra
         env: ``QuadrupedEnv``.
         start: x, y in m and heading in rad.
         steps: longest walk, in steps of the policy.
+        seed: of the phase of the gait at the start.
         keep_frames: keep what the camera showed.
 
     Returns:
@@ -174,7 +183,7 @@ def walk(agent: Agent, env: Any, start: Sequence[float], steps: int, *, keep_fra
 
     Source: paper Section IV-B (the learned policy on the quadruped).
     """
-    pixels, info = env.reset(options={"pose": [float(v) for v in start]})
+    pixels, info = env.reset(seed=seed, options={"pose": [float(v) for v in start]})
     poses, actions, values, frames = [info["pose"]], [], [], [pixels[3:]]
     entered, hit, fallen, left = bool(info["unsafe"]), False, False, False
     for _ in range(steps):
@@ -234,7 +243,7 @@ def evaluate_walks(
     try:
         for name, group in zip(("S", "{B <= 0}"), starts, strict=False):
             bar = tqdm(group.tolist(), desc=f"walks from {name}", disable=not progress, leave=False)
-            groups.append([walk(agent, env, state, steps) for state in bar])
+            groups.append([walk(agent, env, state, steps, seed=config.seed + k) for k, state in enumerate(bar)])
     finally:
         if env is not None:
             env.close()

@@ -89,6 +89,11 @@ def make_physics(model: DubinsEnv) -> Callable[[], Any]:
         ) from error
     return lambda: kind(
         max_yaw_rate=model.max_yaw_rate,
+        speed=model.speed,
+        dt=model.dt,
+        arena_half_size=model.arena_half_size,
+        safe_half_size=model.safe_half_size,
+        unsafe_half_size=model.unsafe_half_size,
         image_size=model.image_size,
         obstacle_shape=model.obstacle_shape,
         obstacle_half_size=model.obstacle_half_size,
@@ -177,7 +182,7 @@ def _film(agent: Agent, env: DubinsEnv, make: Callable[[], Any], seconds: float)
     world = make()
     try:
         steps = max(1, round(seconds / env.dt))
-        return walk(agent, world, (-1.7, 0.1, 0.0), steps, keep_frames=True)
+        return walk(agent, world, (-1.7, 0.1, 0.0), steps, seed=0, keep_frames=True)
     finally:
         world.close()
 
