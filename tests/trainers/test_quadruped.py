@@ -59,7 +59,9 @@ def straight_ahead(barrier: float = -1.0) -> Agent:
 def test_a_walk_ends_where_the_arena_does():
     found = walk(straight_ahead(), World(), (1.75, 0.0, 0.0), 20, keep_frames=True)
     assert found.left
-    assert not (found.entered or found.hit or found.fallen)
+    assert not (found.entered)
+    assert not (found.hit)
+    assert not (found.fallen)
     assert len(found.poses) == len(found.barrier) == len(found.frames) == len(found.actions) + 1 == 4
     assert found.frames.dtype == torch.uint8
 
