@@ -299,9 +299,10 @@ class SafePolicyTraining:
         """Warm start: SaLaD on random-action data, of which every frame is stored once."""
         rep = self.config.representation
         stores = self._labelled_stores()
-        if hasattr(self.encoder, "fit") and self.step == 0:
+        fit = getattr(self.encoder, "fit", None)
+        if callable(fit) and self.step == 0:
             mixed = stores["any"].get(torch.arange(min(2000, len(stores["any"]))))
-            self.encoder.fit(mixed["frames"][:, 1])
+            fit(mixed["frames"][:, 1])
         loss = SaLaDLoss(
             self.encoder,
             self.warm_dynamics,

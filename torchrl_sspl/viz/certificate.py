@@ -12,6 +12,7 @@ _TITLES = {
     "statistical": "What fresh episodes show",
     "paper": "The paper's conditions, with its margins",
 }
+_SUCCESS = {"deterministic": "proved", "statistical": "yes", "paper": "yes, all of them"}
 
 
 def certificate_section(certificate: Certificate) -> str:
@@ -39,7 +40,7 @@ def certificate_section(certificate: Certificate) -> str:
         if name not in certificate.layers:
             continue
         layer = certificate.layers[name]
-        parts.append(f"<h3>{_TITLES[name]}</h3><p>{badge('yes: all hold' if layer.holds else layer.verdict)}</p>")
+        parts.append(f"<h3>{_TITLES[name]}</h3><p>{badge(_SUCCESS[name] if layer.holds else layer.verdict)}</p>")
         parts.append(table(("Statement", "Status", "Value", "n", "Remark"), [_row(s) for s in layer.statements]))
     return "".join(parts) + "</section>"
 
@@ -74,7 +75,7 @@ def _row(statement: Statement) -> list[str]:
     if s.kind == ASSUMED:
         status = "assumed" if s.value is None else "reported"
     elif s.holds:
-        status = badge("proved" if s.kind == PROVED else "yes: measured")
+        status = badge("proved" if s.kind == PROVED else "yes")
     else:
         miss = "" if s.misses_by is None else f", misses by {format_value(s.misses_by, s.unit)}"
         status = badge(f"not {s.kind}{miss}" if s.kind == PROVED else f"does not hold{miss}")
