@@ -4,10 +4,17 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: pendulum test docs wheel release-check clean
+.PHONY: pendulum quadruped demo test docs wheel release-check clean
 
 pendulum: $(VENV)/.viz
 	$(BIN)/python examples/inverted_pendulum.py $(ARGS)
+
+quadruped: $(VENV)/.quadruped
+	$(BIN)/python examples/quadruped_obstacle.py $(ARGS)
+
+# The shipped agent in full physics: a film and a report in runs/demo.
+demo: $(VENV)/.quadruped
+	$(BIN)/python examples/quadruped_obstacle.py mode=evaluate dubins=false walks=5 out_dir=runs/demo $(ARGS)
 
 test: $(VENV)/.test
 	$(BIN)/ruff check .
