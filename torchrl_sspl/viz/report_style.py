@@ -8,7 +8,7 @@ CSS = """
 *{box-sizing:border-box}
 body{margin:0;background:var(--page);color:var(--ink);font:16px/1.5 system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}
 main{max-width:1000px;margin:0 auto;padding:24px 16px 64px}
-h1{font-size:1.7rem;line-height:1.2;margin:0}h2{font-size:1.2rem;margin:0 0 .6rem}h3{font-size:.95rem;margin:0 0 .2rem}
+h1{font-size:1.7rem;line-height:1.2;margin:0}h2{font-size:1.2rem;margin:0 0 .6rem}h3{font-size:.95rem;margin:0 0 .2rem}section>h3{margin-top:1.3rem}
 .facts{color:var(--soft);margin:.25rem 0 1rem;font-size:.9rem}
 section{background:var(--card);border:1px solid var(--line);border-radius:10px;padding:18px;margin:0 0 18px;overflow-wrap:anywhere}
 .verdict{border-left:8px solid var(--none)}.verdict h2{font-size:1.45rem;line-height:1.25}
