@@ -297,6 +297,8 @@ def readme_section(title: str) -> str:
     if found is None:
         raise ValueError(f"expected a section '{title}' in README.md, found none: rename it in the page that includes it")
     text = found[1].replace("[docs/deviations.md](", "[Deviations](")
+    # What is not part of the site is named, but not linked.
+    text = re.sub(r"\[([^\]]+)\]\((?!https?:|docs/|examples/\w+\.py)[^)]*\)", r"\1", text)
     text = re.sub(r"\]\(docs/", "](", text)
     return re.sub(r"\]\(examples/(\w+)\.py\)", r"](gallery/\1.md)", text).strip()
 
