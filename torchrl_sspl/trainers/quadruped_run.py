@@ -17,7 +17,7 @@ from torchrl_sspl.modules.agent import Agent, agent_directory, load
 from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.evaluation import Evaluation, Measurement
 from torchrl_sspl.trainers.pipeline import Check
-from torchrl_sspl.trainers.quadruped import QUADRUPED, WalkConfig, evaluate_dubins, evaluate_walks, walk
+from torchrl_sspl.trainers.quadruped import QUADRUPED, Walk, WalkConfig, evaluate_dubins, evaluate_walks, walk
 from torchrl_sspl.trainers.run import METRICS_FILE, train
 from torchrl_sspl.viz.report import format_value
 
@@ -133,7 +133,8 @@ def run_quadruped(
         found = evaluate_dubins(agent, env, config.evaluation, progress=config.progress)
         evaluation.measurements |= found.measurements
         evaluation.arrays = found.arrays
-    walks, film = [], None
+    walks: list[Walk] = []
+    film = None
     if task.walks.episodes:
         try:
             make = make_physics(env)
