@@ -24,8 +24,8 @@ def off_centre(info):  # the pusher's larger distance from the middle of the tab
 
 class Encoder(nn.Sequential):  # two RGB frames -> a latent in [-1, 1]
     def __init__(self, latent_dim):
-        convolutions = [nn.Conv2d(6, 24, 5, 2), nn.ReLU(), nn.Conv2d(24, 32, 3, 2), nn.ReLU(), nn.Conv2d(32, 32, 3, 2)]
-        super().__init__(*convolutions, nn.ReLU(), nn.Flatten(), nn.Linear(512, 64), nn.ReLU(), nn.Linear(64, latent_dim))
+        see = [nn.AvgPool2d(2), nn.Conv2d(6, 32, 3, 2), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU(), nn.Flatten()]
+        super().__init__(*see, nn.Linear(800, 128), nn.ReLU(), nn.Linear(128, latent_dim))
 
     def forward(self, pixels):
         flat = pixels.reshape(-1, *pixels.shape[-3:]).float() / 127.5 - 1
@@ -44,6 +44,7 @@ my_env = partial(
 )
 
 if __name__ == "__main__":
-    defaults = {"out_dir": "runs/push", "optim.lr": 2e-3, "trainer.optim_steps_per_batch": 96}
-    outcome = run_experiment(my_env, sys.argv[1:], encoder=Encoder, title="Pusher on a table", **defaults)
+    size = {"trainer.total_frames": 9600, "trainer.optim_steps_per_batch": 320, "trainer.warm_start_steps": 1500}
+    names = {"title": "Pusher on a table", "out_dir": "runs/push"}
+    outcome = run_experiment(my_env, sys.argv[1:], encoder=Encoder, **names, **size, **{"optim.lr": 2e-3})
     print(outcome.summary(), f"\nreport: {outcome.report}")
