@@ -39,6 +39,8 @@ _NAMES = {
     "viability_kernel": "certification.ground_truth",
     "recoverable_set": "certification.ground_truth",
     "evaluate": "trainers.evaluation",
+    "certify": "trainers.certify",
+    "Certificate": "certification.certificate",
 }
 
 __all__ = ["__version__", *_NAMES, *_SUBPACKAGES]

@@ -1,0 +1,44 @@
+"""What can be said about frozen networks: proofs on the latent domain, measurements with confidence, true kernels."""
+
+from __future__ import annotations
+
+from torchrl_sspl.certification.branch_and_bound import Budget, Outcome
+from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, Statement
+from torchrl_sspl.certification.conditions import (
+    ClosedLoop,
+    closed_loop,
+    decide_domain,
+    decide_invariance,
+    decide_vacuity,
+    find_counterexamples,
+    largest_error,
+    search_level,
+)
+from torchrl_sspl.certification.ground_truth import ViabilityKernel, recoverable_set, viability_kernel
+from torchrl_sspl.certification.layers import Sample, deterministic_layer, paper_layer, statistical_layer
+from torchrl_sspl.certification.statistics import clopper_pearson
+
+__all__ = [
+    "Budget",
+    "Certificate",
+    "ClosedLoop",
+    "Layer",
+    "Outcome",
+    "Reason",
+    "Sample",
+    "Statement",
+    "ViabilityKernel",
+    "clopper_pearson",
+    "closed_loop",
+    "decide_domain",
+    "decide_invariance",
+    "decide_vacuity",
+    "deterministic_layer",
+    "find_counterexamples",
+    "largest_error",
+    "paper_layer",
+    "recoverable_set",
+    "search_level",
+    "statistical_layer",
+    "viability_kernel",
+]
