@@ -223,3 +223,15 @@ def test_what_cannot_reach_the_goal_gets_the_horizon():
     steps = reach_times((chain - 1).clamp_min(0)[:, None], chain, goal, horizon=20, neighbours=1)
     assert float(steps.min()) >= 20
     assert float(steps.max()) <= 21
+
+
+def test_ways_back_do_not_lead_through_where_there_is_no_data():
+    # Two ways to the goal at 1: through a gap without data in one leap, or in small steps around it.
+    z = torch.cat([torch.linspace(0.0, 0.3, 31), torch.linspace(0.7, 0.95, 26)])[:, None]
+    leap, step = z + 0.3, z + 0.05
+    goal = torch.tensor([[1.0]])
+    free = reach_times(torch.stack([leap, step], 1), z, goal, neighbours=1)
+    careful = reach_times(torch.stack([leap, step], 1), z, goal, neighbours=1, known_within=0.03)
+    assert float(free[25].min()) < 20  # the nearest known latent stands in for the gap
+    assert float(careful[25].min()) >= 120
+    torch.testing.assert_close(careful[-3:].min(1).values, free[-3:].min(1).values)

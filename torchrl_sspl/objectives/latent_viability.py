@@ -260,7 +260,15 @@ def barrier_targets(
     return lipschitz_bound * torch.where(member, -near_outside, off_tube), member
 
 
-def reach_times(successors: Tensor, starts: Tensor, goal: Tensor, *, horizon: int = 120, neighbours: int = 3) -> Tensor:
+def reach_times(
+    successors: Tensor,
+    starts: Tensor,
+    goal: Tensor,
+    *,
+    horizon: int = 120,
+    neighbours: int = 3,
+    known_within: float | None = None,
+) -> Tensor:
     r"""Steps to a goal set under every action, by dynamic programming on the cloud of latents.
 
     .. math:: T(z_i, u) = 1 + \overline{T}(d(z_i, u)), \quad \overline T(z) = \operatorname{mean}_{j \in nn(z)} \min_u T(z_j, u)
@@ -271,6 +279,8 @@ def reach_times(successors: Tensor, starts: Tensor, goal: Tensor, *, horizon: in
         goal: ``(m, p)`` latents of the goal, where the time is zero.
         horizon: time given to what cannot reach the goal.
         neighbours: latents over which the time of a successor is averaged.
+        known_within: successors farther than this from every latent are taken for a dead end: where there is no data
+            the model says nothing, and a way that leads there may not lead back.
 
     Returns:
         ``(n, k)`` steps, at most ``horizon + 1``.
@@ -285,12 +295,14 @@ def reach_times(successors: Tensor, starts: Tensor, goal: Tensor, *, horizon: in
     """
     n, k, p = successors.shape
     cloud = torch.cat([starts, goal])
-    found = _tree(cloud).query(successors.detach().cpu().numpy().reshape(-1, p), k=neighbours)[1]
+    distance, found = _tree(cloud).query(successors.detach().cpu().numpy().reshape(-1, p), k=neighbours)
     index = torch.as_tensor(found).reshape(n, k, -1)
+    nearest = torch.as_tensor(distance, dtype=torch.float32).reshape(n, k, -1)[..., 0]
+    unknown = torch.zeros(n, k, dtype=torch.bool) if known_within is None else nearest > known_within
     times = torch.cat([torch.full((n,), float(horizon)), torch.zeros(len(goal))])
     per_action = torch.full((n, k), float(horizon))
     for _ in range(4 * horizon):
-        per_action = 1.0 + times[index].mean(-1)
+        per_action = torch.where(unknown, float(horizon), times[index].mean(-1)) + 1.0
         best = per_action.min(1).values.clamp(max=float(horizon))
         if float((best - times[:n]).abs().max()) < 1e-2:
             break

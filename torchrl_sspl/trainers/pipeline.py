@@ -46,6 +46,7 @@ from torchrl_sspl.trainers.loggers import METRICS, log_scalars
 
 CHECKPOINT_FILE = "checkpoint.pt"
 _ENCODE_CHUNK = 1000
+_KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
 
@@ -648,7 +649,7 @@ class SafePolicyTraining:
         keep = torch.softmax(found.clearance[kept] / 0.01, 1) @ actions
         best[inside] = keep
         outer = (~inside).nonzero()[:, 0]
-        times = reach_times(self._successors(z[outer], actions), z[outer], z[inside])
+        times = reach_times(self._successors(z[outer], actions), z[outer], z[inside], known_within=_KNOWN_WITHIN)
         best[outer] = torch.softmax(-times / 0.1, 1) @ actions
         weight = torch.ones(len(z))
         weight[outer] = (times.min(1).values < 100).float()
