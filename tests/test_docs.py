@@ -110,7 +110,7 @@ def test_sections_of_the_readme_are_included_with_their_links_bent():
 
 
 def test_roles_and_formulas_become_markdown():
-    text = "A :math:`a\n    b` of :class:`~x.y.Z` and ``f()``.\n\n.. math:: c\n\n    .. math::\n        d &= e \\\\\n        f\n\nEnd."
+    text = "A :math:`a\n    b` of :class:`~x.y.Z` and ``f()``.\n\n.. math:: c\n\nText.\n\n    .. math::\n        d &= e \\\\\n        f\n\nEnd."
     done = hooks.to_markdown(text)
     assert "\\(a b\\) of `Z` and `f()`" in done
     assert "$$\nc\n$$" in done
