@@ -2,8 +2,8 @@
 
     python examples/quadruped_obstacle.py [key=value ...]
 
-trains on the Dubins car, evaluates on it against its true kernel and on the robot that walks in full physics, and
-writes metrics.json, figures/, report.html and the agent into out_dir. Useful keys:
+trains on a Dubins car that turns as late as the robot, evaluates on the paper's Dubins car against its true kernel and on
+the robot that walks in full physics, and writes metrics.json, figures/, report.html and the agent into out_dir. Useful keys:
 
     mode=train|evaluate      evaluate: no training, the agent is that of agent=
     agent=quadruped          shipped agent or run directory (mode=evaluate)
@@ -22,6 +22,7 @@ import sys
 from pathlib import Path
 
 from torchrl_sspl.envs import DubinsEnv
+from torchrl_sspl.envs.dubins import YAW_LAG
 from torchrl_sspl.errors import ConfigError, SSPLError
 from torchrl_sspl.trainers.config import PRESETS, TrainingConfig, make_config
 from torchrl_sspl.trainers.quadruped import WalkConfig
@@ -55,10 +56,20 @@ def configure(arguments: list[str]) -> tuple[TrainingConfig, QuadrupedRun]:
     return config, QuadrupedRun(agent, own["dubins"] == "true", WalkConfig(episodes=int(walks)))
 
 
+def turns_at_once(batch_size: list[int], seed: int) -> DubinsEnv:
+    """The Dubins car of the paper, with a true kernel of three dimensions."""
+    return DubinsEnv(batch_size=batch_size, seed=seed)
+
+
+def turns_late(batch_size: list[int], seed: int) -> DubinsEnv:
+    """The Dubins car that turns as late as the walking robot does."""
+    return DubinsEnv(batch_size=batch_size, seed=seed, yaw_lag=YAW_LAG)
+
+
 def main(arguments: list[str]) -> int:
     try:
         config, task = configure(arguments)
-        outcome = run_quadruped(config, lambda batch_size, seed: DubinsEnv(batch_size=batch_size, seed=seed), task)
+        outcome = run_quadruped(config, turns_at_once, task, make_training_env=turns_late)
     except SSPLError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 2

@@ -13,7 +13,15 @@ from torchrl.objectives import LossModule
 
 from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.objectives import LipschitzLoss, PolicyDeviationLoss, SaLaDLoss, SSPLLoss, SynthesisLoss
+from torchrl_sspl.objectives import (
+    ActionValueLoss,
+    LipschitzLoss,
+    PolicyDeviationLoss,
+    SaLaDLoss,
+    SSPLLoss,
+    SynthesisLoss,
+    TargetLoss,
+)
 
 ROWS = 12
 
@@ -54,6 +62,11 @@ def batch(source: str, rows: int = ROWS) -> TensorDict:
     data["next", key] = torch.randn(rows, size, generator=generator).tanh()
     if source == "latent":
         data["residual"] = 0.1 * torch.randn(rows, size, generator=generator)
+        data["barrier_target"] = torch.randn(rows, 1, generator=generator)
+        data["inside"] = data["barrier_target"] < 0
+        data["action_target"] = torch.randn(rows, 1, generator=generator)
+        data["action_weight"] = torch.rand(rows, 1, generator=generator)
+        data["action_value"] = torch.randn(rows, 5, generator=generator)
     return data
 
 
@@ -66,7 +79,7 @@ class Case:
         loss: class of the loss.
         source: entry that the batch holds: ``"pixels"``, ``"frames"`` or ``"latent"``.
         reaches: networks that each term may move, and has to.
-        count: how many of the networks the loss takes.
+        takes: networks that the loss takes, in order.
         options: keyword arguments of the loss.
         pointwise: no term depends on which other rows are in the batch.
         rows: the terms belong to rows of the batch.
@@ -77,20 +90,16 @@ class Case:
     loss: type[LossModule]
     source: str
     reaches: dict[str, set[str]]
-    count: int = 4
+    takes: str
     options: dict[str, Any] = field(default_factory=dict)
     pointwise: bool = True
     rows: bool = True
     unreached: tuple[str, ...] = ()
 
     def nets(self) -> tuple[nn.Module | None, ...]:
-        encoder, dynamics, barrier, policy = networks(self.source)
-        return {
-            1: (LMIBarrier(2, (6,)),),
-            2: (encoder, policy),
-            3: (encoder, dynamics, barrier),
-            4: (encoder, dynamics, barrier, policy),
-        }[self.count]
+        names = ("encoder", "dynamics", "barrier", "policy")
+        found = dict(zip(names, networks(self.source), strict=True)) | {"lmi_barrier": LMIBarrier(2, (6,))}
+        return tuple(found[name] for name in self.takes.split())
 
     def build(self, kind: Callable[..., LossModule] | None = None, **options: Any) -> LossModule:
         loss = (kind or self.loss)(*self.nets(), **{**self.options, **options})
@@ -137,18 +146,26 @@ SYNTHESIS = {
 }
 ALL = {"encoder", "dynamics", "barrier", "actor_network"}
 
+ALL_FOUR = "encoder dynamics barrier policy"
+
 CASES = [
-    Case("salad", SaLaDLoss, "pixels", SALAD, 3, WIDE),
+    Case("salad", SaLaDLoss, "pixels", SALAD, "encoder dynamics barrier", WIDE),
     Case(
-        "salad-online", SaLaDLoss, "pixels", SALAD_EXTRA, 3, WIDE | EXTRAS | {"consistency": "online"}, False
+        "salad-online",
+        SaLaDLoss,
+        "pixels",
+        SALAD_EXTRA,
+        "encoder dynamics barrier",
+        WIDE | EXTRAS | {"consistency": "online"},
+        False,
     ),
-    Case("synthesis", SynthesisLoss, "pixels", SYNTHESIS, 4, WIDE | GROWTH | {"growth_coeff": 0.0}),
+    Case("synthesis", SynthesisLoss, "pixels", SYNTHESIS, ALL_FOUR, WIDE | GROWTH | {"growth_coeff": 0.0}),
     Case(
         "synthesis-latent",
         SynthesisLoss,
         "latent",
         SYNTHESIS | {"loss_growth": {"barrier"}},
-        4,
+        ALL_FOUR,
         GROWTH | {"mode": "R1", "decay": 0.3, "dynamics_margin": 0.0},
     ),
     Case(
@@ -156,7 +173,7 @@ CASES = [
         SynthesisLoss,
         "pixels",
         {"loss_synthesis": ALL},
-        4,
+        ALL_FOUR,
         WIDE | {"mode": "paper", "successor": "target", "detach": ()},
     ),
     Case(
@@ -164,7 +181,7 @@ CASES = [
         PolicyDeviationLoss,
         "pixels",
         {"loss_policy_deviation": {"encoder", "actor_network"}},
-        2,
+        "encoder policy",
         {"user_policy": "data", "detach": ()},
     ),
     Case(
@@ -172,7 +189,7 @@ CASES = [
         LipschitzLoss,
         "latent",
         {"loss_lipschitz": {"barrier"}},
-        1,
+        "lmi_barrier",
         rows=False,
         unreached=("bias",),
     ),
@@ -181,7 +198,7 @@ CASES = [
         SSPLLoss,
         "frames",
         SALAD | {"loss_synthesis": ALL, "loss_policy_deviation": {"encoder", "actor_network"}},
-        4,
+        ALL_FOUR,
         WIDE | {"preset": "paper", "reduction": "mean"},
     ),
     Case(
@@ -189,8 +206,29 @@ CASES = [
         SSPLLoss,
         "frames",
         SALAD_EXTRA | SYNTHESIS,
-        4,
+        ALL_FOUR,
         WIDE | GROWTH | EXTRAS | {"preset": "sound", "growth_coeff": 0.0},
         False,
+    ),
+    Case(
+        "target",
+        TargetLoss,
+        "latent",
+        {
+            "loss_target": {"barrier"},
+            "loss_policy_target": {"actor_network"},
+            "loss_safe": {"barrier"},
+            "loss_unsafe": {"barrier"},
+        },
+        "barrier policy",
+        {"safety_margin": 3.0, "safe_coeff": 1.0, "unsafe_coeff": 1.0, "action_scale": 2.0},
+    ),
+    Case(
+        "action-value",
+        ActionValueLoss,
+        "latent",
+        {"loss_action_value": {"actor_network"}},
+        "policy",
+        {"action_scale": 2.0},
     ),
 ]

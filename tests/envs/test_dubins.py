@@ -43,6 +43,12 @@ def test_with_the_yaw_lag_the_last_command_is_part_of_the_state():
     assert env.observe(first).shape == (1, 6, 32, 32)
 
 
+def test_robots_that_turn_late_start_walking_straight_ahead():
+    env = DubinsEnv(batch_size=[8], yaw_lag=(0.05, 0.06), image_size=32, seed=0)
+    assert env.sample_states(100)[:, 3].abs().sum() == 0
+    assert env.reset()["state"][:, 3].abs().sum() == 0
+
+
 def test_regions_and_exit():
     env = DubinsEnv(image_size=32)
     states = torch.tensor([[0.69, 0.0, 1.0], [0.71, 0.0, 1.0], [1.51, 0.0, 9.0], [0.0, -1.9, 0.0], [2.1, 0.0, 0.0]])

@@ -14,6 +14,9 @@ from torchrl_sspl.objectives.latent_viability import (
     normal_projectors,
     reach_times,
     robust_invariant_set,
+    safety_values,
+    signed_margin,
+    value_targets,
 )
 
 # --- an unstable line: z+ = 1.5 z + u, |u| <= 0.2; inside |z| < 1 it can be held exactly up to |z| = 0.2 / 0.5 = 0.4 ---
@@ -87,6 +90,52 @@ def test_every_point_of_the_set_has_an_action_that_stays_in_it_and_its_clearance
 def test_outside_the_set_nothing_has_a_clearance():
     found = robust_invariant_set(unstable(LINE), LINE, RIM)
     assert float(found.clearance[~found.inside].abs().max()) == 0.0
+
+
+# --- values of actions, on the same line ---
+
+BOTH = torch.cat([LINE, RIM])
+MARGIN = signed_margin(BOTH, torch.arange(len(BOTH)) >= len(LINE))
+
+
+@pytest.mark.parametrize("error", [0.0, 0.05, 0.1])
+def test_margin_stays_positive_exactly_where_the_line_can_be_held(error):
+    residuals = torch.tensor([[error], [-error]]).expand(len(BOTH), 2, 1)
+    value = safety_values(unstable(BOTH), BOTH, MARGIN, residuals=residuals).amax(1).minimum(MARGIN)
+    held = BOTH[value > 0, 0]
+    assert float(held.max()) == pytest.approx((0.2 - error) / 0.5, abs=0.016)
+    assert float(held.min()) == pytest.approx(-(0.2 - error) / 0.5, abs=0.016)
+
+
+def test_values_tell_actions_apart_where_one_step_does_not():
+    # In the middle of the line every action keeps a large clearance; the value knows where it leads.
+    near = int((BOTH[:, 0] - 0.38).abs().argmin())
+    value = safety_values(unstable(BOTH), BOTH, MARGIN)[near]
+    assert int(value.argmax()) == 0
+    assert float(value[0] - value[2]) > 0.5
+
+
+def test_margin_never_falls_along_the_policy_that_it_belongs_to():
+    policy = (-0.5 * BOTH).clamp(-0.2, 0.2)
+    step = (1.5 * BOTH + policy)[:, None]
+    value = safety_values(step, BOTH, MARGIN, neighbours=1)[:, 0].minimum(MARGIN)
+    following = value[(step[:, 0, None] - BOTH[None]).norm(dim=-1).argmin(1)]
+    assert bool((following >= value - 2e-3).all())
+
+
+def test_targets_rise_off_the_data_and_keep_the_sign_of_the_margin_on_it():
+    data = torch.cat([BOTH, torch.zeros_like(BOTH)], -1)
+    target = value_targets(data, data, MARGIN, tube_radius=0.3, lipschitz_bound=2.0)
+    clear = MARGIN.abs() > 0.02  # beside the border two points share a value
+    assert bool(((target < 0) == (MARGIN > 0))[clear].all())
+    assert float(target.min()) >= -0.6 - 1e-6
+    away = value_targets(data + torch.tensor([0.0, 0.5]), data, MARGIN, tube_radius=0.3, lipschitz_bound=2.0)
+    assert float(away.min()) == pytest.approx(0.4, abs=1e-5)
+
+
+def test_values_need_a_row_for_every_latent():
+    with pytest.raises(ShapeError, match="one row per latent"):
+        safety_values(unstable(LINE), LINE, MARGIN)
 
 
 # --- the integrator: z+ = z + u, every point can be held -------------------------------------------------------------

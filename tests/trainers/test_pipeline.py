@@ -58,6 +58,25 @@ def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkp
     assert resumed.checks == uninterrupted[1].checks
 
 
+@pytest.mark.parametrize("checkpoints", [6, 11])
+def test_a_training_whose_policy_is_taught_first_continues_bit_for_bit_too(tmp_path, checkpoints):
+    taught = ("synthesis.teacher=value", "synthesis.teach_steps=4", "synthesis.counterexamples=0")
+    whole = training(tmp_path / "whole", *taught)
+    expected = whole.run()
+    assert [name for name, _ in whole.phases()].count("teach") == 2
+    Interrupted.after = checkpoints
+    with pytest.raises(Killed):
+        training(tmp_path / "part", *taught, kind=Interrupted).run()
+    resumed = training(tmp_path / "part", *taught).run()
+    for name, value in resumed.agent.state_dict().items():
+        assert torch.equal(value, expected.agent.state_dict()[name]), name
+
+
+def test_an_unknown_teacher_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="clearance, value"):
+        training(tmp_path, "synthesis.teacher=mother").run()
+
+
 def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
     other = training(tmp_path, "seed=1").run().agent.state_dict()
     assert any(not torch.equal(v, other[k]) for k, v in uninterrupted[1].agent.state_dict().items())

@@ -249,6 +249,16 @@ class DubinsEnv(SafetyEnv):
         before = state[..., :2] - step * torch.cat([heading.cos(), heading.sin()], -1)
         return torch.cat([before, heading, torch.zeros_like(state[..., 3:])], -1)
 
+    def sample_states(
+        self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None
+    ) -> Tensor:
+        """States as in ``SafetyEnv``; with a yaw lag of robots that were walking straight ahead, as ``previous_state``
+        shows them."""
+        states = super().sample_states(n, generator, region=region)
+        if self.yaw_lag is not None:
+            states[..., 3] = 0.0
+        return states
+
     def gait_phase(self, state: Tensor) -> Tensor:
         """Phase of the gait in which a state is drawn, ``(*batch, state_dim) -> (*batch,)`` in [0, 1)."""
         mixed = 43.7585 * state[..., 0] + 78.233 * state[..., 1] + 27.619 * state[..., 2].sin()

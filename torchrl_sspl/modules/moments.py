@@ -67,7 +67,7 @@ class ColourMoments(nn.Module):
         if len(frames) < 10:
             raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
         self.background.copy_(frames[:2000].median(0).values)
-        centre = torch.cat([self.centres(part) for part in frames.split(500)]).double()
+        centre = torch.cat([self.centres(part) for part in frames.split(32)]).double()
         values, vectors = torch.linalg.eigh(torch.cov(centre.T))
         kept = self.whitening.shape[1]
         scale = values[-kept:].clamp_min(1e-8).rsqrt()
@@ -76,7 +76,9 @@ class ColourMoments(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Whitened centres ``(n, kept)`` of frames ``(n, c, H, W)``."""
-        return (self.centres(frames) - self.mean) @ self.whitening
+        # A few frames at a time stay in the cache.
+        centre = torch.cat([self.centres(part) for part in frames.split(32)])
+        return (centre - self.mean) @ self.whitening
 
 
 class MomentEncoder(FrameEncoder):

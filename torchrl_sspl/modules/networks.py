@@ -215,15 +215,22 @@ class FrameEncoder(nn.Module):
         batch = frames.shape[:-3]
         # Not next(self.parameters()): a delayed copy of the weights has none.
         dtype = cast(Tensor, self.latent_head[0].weight).dtype
-        flat = frames.reshape(-1, *frames.shape[-3:]).to(dtype)
-        height, width = flat.shape[-2:]
-        if height % self.pool_to[0] == 0 and width % self.pool_to[1] == 0:
-            # The same average as the adaptive pooling, several times faster.
-            kernel = (height // self.pool_to[0], width // self.pool_to[1])
-            pooled = flat if kernel == (1, 1) else F.avg_pool2d(flat, kernel)
+        flat = frames.reshape(-1, *frames.shape[-3:])
+        if flat.device.type == "cpu" and not torch.compiler.is_compiling():
+            # A few frames at a time stay in the cache: more than twice as fast, the same numbers.
+            pooled = torch.cat([self._pool(part.to(dtype)) / 127.5 - 1.0 for part in flat.split(32)])
         else:
-            pooled = F.adaptive_avg_pool2d(flat, self.pool_to)
-        return self.trunk(pooled / 127.5 - 1.0).reshape(*batch, self.features)
+            pooled = self._pool(flat.to(dtype)) / 127.5 - 1.0
+        return self.trunk(pooled).reshape(*batch, self.features)
+
+    def _pool(self, frames: Tensor) -> Tensor:
+        """Average frames ``(n, c, H, W)`` to ``pool_to``."""
+        height, width = frames.shape[-2:]
+        if height % self.pool_to[0] or width % self.pool_to[1]:
+            return F.adaptive_avg_pool2d(frames, self.pool_to)
+        # The same average as the adaptive pooling, several times faster.
+        kernel = (height // self.pool_to[0], width // self.pool_to[1])
+        return frames if kernel == (1, 1) else F.avg_pool2d(frames, kernel)
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
         """Latent from the features of two successive frames.

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from torchrl_sspl.objectives.action_value import ActionValueLoss
 from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
 from torchrl_sspl.objectives.deviation import PolicyDeviationLoss
 from torchrl_sspl.objectives.lipschitz import LipschitzLoss
 from torchrl_sspl.objectives.salad import SaLaDLoss
 from torchrl_sspl.objectives.sspl import PRESETS, SSPLLoss
 from torchrl_sspl.objectives.synthesis import SynthesisLoss
+from torchrl_sspl.objectives.target import TargetLoss
 
 __all__ = [
+    "ActionValueLoss",
     "PRESETS",
     "LatentBatch",
     "LatentLoss",
@@ -18,4 +21,5 @@ __all__ = [
     "SSPLLoss",
     "SaLaDLoss",
     "SynthesisLoss",
+    "TargetLoss",
 ]

@@ -335,6 +335,10 @@ class LatentLoss(LossModule):
             )
         return value
 
+    def _counted(self, tensordict: TensorDictBase, key: NestedKey, field: str, batch: LatentBatch) -> Tensor:
+        """An entry, zero in the rows that do not count."""
+        return _clean(self._get(tensordict, key, field), batch.valid)
+
     def _valid(self, tensordict: TensorDictBase) -> Tensor | None:
         valid = None
         for key in self._loss_mask_keys():

@@ -308,3 +308,135 @@ def reach_times(
             break
         times[:n] = best
     return per_action
+
+
+def safety_values(
+    successors: Tensor,
+    latent: Tensor,
+    margin: Tensor,
+    *,
+    residuals: Tensor | None = None,
+    neighbours: int = 3,
+    smoothing: float = 0.02,
+    horizon: int = 60,
+) -> Tensor:
+    r"""Least margin that an action leaves on all that follows, whatever the latent error among the given ones.
+
+    .. math:: Q(z_i, u) = \min_e \overline V(d(z_i, u) + e), \qquad V(z_i) = \min(m_i, \max_u Q(z_i, u))
+
+    with :math:`\overline V` the mean over the nearest latents, weighted by the inverse of their distance. Unlike the
+    clearance of one step it tells actions apart long before the border of what can be kept is reached.
+
+    Args:
+        successors: ``(n, k, p)`` predicted successors of every latent under every action.
+        latent: ``(n, p)`` latents.
+        margin: ``(n,)`` how far a latent is from what it must not become; negative there.
+        residuals: ``(n, j, p)`` observed errors of the dynamics near every latent; none if not given.
+        neighbours: latents over which the value of a successor is averaged.
+        smoothing: distance that is added to distances before they are inverted.
+        horizon: steps looked ahead.
+
+    Returns:
+        ``(n, k)`` values Q.
+
+    Raises:
+        ShapeError: if the leading sizes differ.
+
+    Source: none (the paper trains its policy on the condition alone); the value is that of Hamilton-Jacobi
+    reachability, on a cloud of latents.
+
+    Example:
+        >>> z = torch.linspace(-1, 1, 21)[:, None]
+        >>> value = safety_values(torch.stack([z - 0.1, z + 0.1], 1), z, 1 - z.abs()[:, 0], neighbours=1)
+        >>> bool(value[5, 1] > value[5, 0]), bool(value[15, 0] > value[15, 1])
+        (True, True)
+    """
+    n, k, p = successors.shape
+    if latent.shape != (n, p) or margin.shape != (n,) or (residuals is not None and residuals.shape[0] != n):
+        raise ShapeError(
+            f"expected latents ({n}, {p}), margins ({n},) and residuals ({n}, j, {p}) for successors "
+            f"{tuple(successors.shape)}, received {tuple(latent.shape)}, {tuple(margin.shape)} and "
+            f"{None if residuals is None else tuple(residuals.shape)}; pass one row per latent"
+        )
+    errors = torch.zeros(n, 1, p) if residuals is None else residuals
+    ends = (successors[:, :, None] + errors[:, None]).reshape(-1, p)
+    distance, found = _tree(latent).query(ends.detach().cpu().numpy(), k=range(1, neighbours + 1))
+    index = torch.as_tensor(found).reshape(n, k, -1, neighbours)
+    weight = 1.0 / (torch.as_tensor(distance, dtype=torch.float32).reshape(index.shape) + smoothing)
+    weight = weight / weight.sum(-1, keepdim=True)
+    value = margin
+    for _ in range(horizon):
+        per_action = (value[index] * weight).sum(-1).amin(-1)
+        best = torch.minimum(margin, per_action.amax(1))
+        change, value = float((best - value).abs().max()), best
+        if change < 1e-3:
+            break
+    return per_action
+
+
+def signed_margin(latent: Tensor, unsafe: Tensor) -> Tensor:
+    r"""Distance to the nearest unsafe latent; for unsafe ones minus the distance to the nearest of the others.
+
+    Args:
+        latent: ``(n, p)`` latents.
+        unsafe: ``(n,)`` bool.
+
+    Returns:
+        ``(n,)`` float32.
+
+    Raises:
+        EmptyRegionError: if all are unsafe, or none.
+
+    Source: none.
+
+    Example:
+        >>> signed_margin(torch.tensor([[0.0], [1.0], [3.0]]), torch.tensor([True, False, False]))
+        tensor([-1.,  1.,  3.])
+    """
+    margin = torch.empty(len(latent))
+    margin[~unsafe] = nearest_distance(latent[~unsafe], latent[unsafe])
+    margin[unsafe] = -nearest_distance(latent[unsafe], latent[~unsafe])
+    return margin
+
+
+def value_targets(
+    queries: Tensor,
+    latent: Tensor,
+    value: Tensor,
+    *,
+    tube_radius: float,
+    lipschitz_bound: float,
+    neighbours: int = 3,
+    smoothing: float = 0.02,
+) -> Tensor:
+    r"""Target of the barrier at any latent: minus the margin that a policy keeps, rising off the data.
+
+    .. math:: B^\star(z) = \max(-\overline V(z), \; L_B (\operatorname{dist}(z, \text{data}) - r))
+
+    The margin V never falls along the policy's own steps, errors included, so every level set of this target is kept; a
+    signed distance promises that of its zero level alone, and there nothing is left for what a network does not fit.
+
+    Args:
+        queries: ``(n, p)`` latents.
+        latent: ``(m, p)`` latents of the data.
+        value: ``(m,)`` margins V, see :func:`safety_values`.
+        tube_radius: distance r from the data up to which a latent may belong to the set.
+        lipschitz_bound: Lipschitz bound of the barrier.
+        neighbours: latents over which V is averaged, weighted by the inverse of their distance.
+        smoothing: distance that is added to distances before they are inverted.
+
+    Returns:
+        ``(n,)`` targets.
+
+    Source: none; at the set's boundary the target meets paper eq. (3)-(4).
+
+    Example:
+        >>> data, value = torch.tensor([[0.0], [1.0]]), torch.tensor([0.2, -0.1])
+        >>> value_targets(torch.tensor([[0.0], [0.5]]), data, value, tube_radius=0.3, lipschitz_bound=1.0, neighbours=1)
+        tensor([-0.2000,  0.2000])
+    """
+    distance, found = _tree(latent).query(queries.detach().cpu().numpy(), k=range(1, neighbours + 1))
+    near = torch.as_tensor(distance, dtype=torch.float32)
+    weight = 1.0 / (near + smoothing)
+    mean = (value[torch.as_tensor(found)] * weight).sum(-1) / weight.sum(-1)
+    return torch.maximum(-mean, lipschitz_bound * (near[:, 0] - tube_radius))

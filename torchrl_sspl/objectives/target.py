@@ -120,7 +120,7 @@ class TargetLoss(LatentLoss):
         """Terms of the loss on a batch of latents with their targets; the batch is not changed."""
         keys = self.tensor_keys
         batch = self._read(tensordict)
-        target = self._get(tensordict, keys.barrier_target, "barrier_target")
+        target = self._counted(tensordict, keys.barrier_target, "barrier_target", batch)
         inside = self._get(tensordict, keys.inside, "inside")
         barrier = self._run("barrier", batch.latent)
         short = (target.clamp_max(self.outside_cap) - barrier).clamp_min(0.0)
@@ -128,8 +128,9 @@ class TargetLoss(LatentLoss):
         near = (-target.abs() / self.scale).exp() + 0.1
         fit = near * residual.where(inside, short.square())
         action = self._run("actor_network", batch.latent)
-        gap = (action - self._get(tensordict, keys.action_target, "action_target")) / self.action_scale
-        weight = self._get(tensordict, keys.action_weight, "action_weight")
+        wanted = self._counted(tensordict, keys.action_target, "action_target", batch)
+        gap = (action - wanted) / self.action_scale
+        weight = self._counted(tensordict, keys.action_weight, "action_weight", batch)
         follow = weight * gap.square().mean(-1, keepdim=True)
         safe, unsafe = batch.region == SAFE, batch.region == UNSAFE
         terms = {

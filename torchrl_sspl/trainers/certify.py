@@ -112,7 +112,7 @@ def _measure(
         """Uniform states for whose latents a condition holds, and these latents."""
         states, latents, count = [], [], 0
         for _ in range(60):
-            state = env.state_space.sample(2 * n, generator=generator)
+            state = env.sample_states(2 * n, generator, region=env.state_space)
             latent = encode_states(agent, env, state)
             kept = keep(latent)
             states.append(state[kept])
@@ -123,8 +123,8 @@ def _measure(
         return torch.cat(states)[:n], torch.cat(latents)[:n]
 
     start, inside = draw(episodes, lambda z: agent.barrier(z)[:, 0] <= level)
-    unsafe_state = env.unsafe_set.sample(episodes, generator=generator)
-    safe_state = env.safe_set.sample(episodes, generator=generator)
+    unsafe_state = env.sample_states(episodes, generator, region=env.unsafe_set)
+    safe_state = env.sample_states(episodes, generator, region=env.safe_set)
     unsafe_latent = encode_states(agent, env, unsafe_state)
     safe_latent = encode_states(agent, env, safe_state)
     unsafe, safe = (agent.barrier(z)[:, 0] for z in (unsafe_latent, safe_latent))

@@ -104,10 +104,19 @@ class SynthesisConfig:
         mined_unsafe: transitions from the rim of U, where the barrier is lowest, that every further round adds.
         exploration: standard deviation of the exploration, as a share of the largest action.
         dynamics_steps: optimiser steps of the refit of the latent dynamics.
+        unsafe_weight: weight of transitions that start in U in the refit of the dynamics; below 1 where what is seen
+            there is not worth the networks' capacity (a robot before the obstacle it stands on).
         tube_radius: distance from the data up to which a latent off the manifold may belong to the safe set.
         residuals: observed errors of the dynamics per latent that the fine-tuning adds to successors.
         residual_spread: standard deviations of the local error that the invariant set of the data tolerates.
         actions: actions per dimension tried at every latent.
+        teacher: what teaches the policy before the barrier is fitted: "clearance" (the action that ends farthest from
+            what lies outside the invariant set, together with the barrier) or "value" (the action that keeps the
+            largest distance from U on all that follows, before the barrier, which then learns what this very policy
+            keeps; for systems in which the best action jumps, as from left to right of an obstacle).
+        teach_steps: steps of the policy alone on the values of actions ("value").
+        teach_spread: standard deviations of the local error that the values of actions tolerate ("value"); larger than
+            residual_spread, the policy acts earlier than its set needs.
         fit_steps: steps in which barrier and policy are regressed onto their targets.
         steer_steps: steps of the policy alone on the condition, with the barrier held still.
         tune_steps: steps of the joint fine-tuning on the losses of the condition.
@@ -134,10 +143,14 @@ class SynthesisConfig:
     mined_unsafe: int = 8000
     exploration: float = 0.15
     dynamics_steps: int = 6000
+    unsafe_weight: float = 1.0
     tube_radius: float = 0.3
     residuals: int = 16
     residual_spread: float = 1.5
     actions: int = 21
+    teacher: str = "clearance"
+    teach_steps: int = 4000
+    teach_spread: float = 1.0
     fit_steps: int = 4000
     steer_steps: int = 1000
     tune_steps: int = 5000

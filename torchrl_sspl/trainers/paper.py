@@ -33,6 +33,10 @@ class PaperTraining(SafePolicyTraining):
     iterations (the printed stop rule, a total loss of zero, is never met with a policy term).
     """
 
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._feasible_state = {k: v.clone() for k, v in self.warm_barrier.state_dict().items()}
+
     def _new_barrier(self) -> nn.Module:  # type: ignore[override]
         net = self.config.network
         return LMIBarrier(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
@@ -45,9 +49,10 @@ class PaperTraining(SafePolicyTraining):
         return self.config.synthesis.tune_steps if name == "joint" else super()._size(name)
 
     def _after_step(self) -> None:
-        """The separate step on L_M, pulled back into the cone where it would leave it."""
+        """The separate step on L_M; both it and the step before are pulled back into the cone where they would leave it."""
         barrier = self.warm_barrier
-        before = getattr(self, "_feasible_state", None) or {k: v.clone() for k, v in barrier.state_dict().items()}
+        # Feasible at the start, after every step, and so in every checkpoint.
+        before = self._feasible_state
         barrier.backtracking_step(before)  # type: ignore[operator]
         loss = barrier.loss() * 1e-3  # type: ignore[operator]
         gradients = torch.autograd.grad(loss, list(barrier.parameters()), allow_unused=True)
@@ -86,13 +91,9 @@ class PaperTraining(SafePolicyTraining):
             (self.encoder, self.warm_dynamics, self.warm_barrier, self.policy), s.lr
         )
 
-        def step() -> TensorDict:
-            if self.step:
-                self._after_step()
-            return loss(self._mixed_batch(stores))
-
-        self._loop(s.tune_steps, networks, step, clip=rep.clip_norm, delayed=loss)
-        self._after_step()
+        self._loop(
+            s.tune_steps, networks, lambda: loss(self._mixed_batch(stores)), clip=rep.clip_norm, delayed=loss
+        )
         self.checks.append(
             Check(number, 0.0, 0, 0, 0, 0, 0.0, 0.0, False, f"the paper's schedule has no held-out check (eta {eta:.3f}, psi {psi:.3f})")
         )

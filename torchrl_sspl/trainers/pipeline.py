@@ -29,7 +29,7 @@ from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.modules.agent import ENCODERS, Agent
-from torchrl_sspl.objectives import SaLaDLoss, SynthesisLoss
+from torchrl_sspl.objectives import ActionValueLoss, SaLaDLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.latent_viability import (
     barrier_targets,
     nearby_residuals,
@@ -37,16 +37,20 @@ from torchrl_sspl.objectives.latent_viability import (
     normal_projectors,
     reach_times,
     robust_invariant_set,
+    safety_values,
+    signed_margin,
+    value_targets,
 )
-from torchrl_sspl.objectives.target import TargetLoss
 from torchrl_sspl.sets import SAFE, UNSAFE, Region
 from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
 from torchrl_sspl.trainers.loggers import METRICS, log_scalars
 
 CHECKPOINT_FILE = "checkpoint.pt"
+TEACHERS = ("clearance", "value")
 _ENCODE_CHUNK = 1000
 _KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
+_VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
 
@@ -95,10 +99,6 @@ class TrainingResult:
     checks: list[Check] = field(default_factory=list)
     stop_reason: str = ""
     seconds: float = 0.0
-
-
-def _one_cycle(optimiser: torch.optim.Optimizer, peak: float, steps: int) -> torch.optim.lr_scheduler.LRScheduler:
-    return torch.optim.lr_scheduler.OneCycleLR(optimiser, peak, total_steps=max(steps, 2), pct_start=0.1)
 
 
 class SafePolicyTraining:
@@ -156,6 +156,7 @@ class SafePolicyTraining:
         self.phase, self.step, self.seconds = 0, 0, 0.0
         self._loop_state: dict[str, Any] | None = None
         self._target_round: int | None = None
+        self.taught: nn.Module | None = None
         self._target_table: TensorDict
         self._rim: TensorDict
         self._last_checkpoint = time.monotonic()
@@ -189,9 +190,11 @@ class SafePolicyTraining:
 
     def phases(self) -> list[tuple[str, int]]:
         """Names of the phases in order, with the round that each belongs to."""
-        rounds = self.config.synthesis.rounds
-        names = ("gather", "dynamics", "fit", "steer", "tune", "check")
-        return [("represent", 0), *((name, k) for k in range(rounds) for name in names)]
+        s = self.config.synthesis
+        if s.teacher not in TEACHERS:
+            raise ConfigError(f"expected synthesis.teacher to be one of {', '.join(TEACHERS)}, received '{s.teacher}'")
+        names = ["gather", "dynamics", *(["teach"] if s.teacher == "value" else []), "fit", "steer", "tune", "check"]
+        return [("represent", 0), *((name, k) for k in range(s.rounds) for name in names)]
 
     def run(self) -> TrainingResult:
         """Train, or continue to train, to the end.
@@ -227,6 +230,7 @@ class SafePolicyTraining:
         return {
             "represent": self.config.representation.steps,
             "dynamics": s.dynamics_steps,
+            "teach": s.teach_steps,
             "fit": s.fit_steps,
             "steer": s.steer_steps,
             "tune": s.tune_steps,
@@ -268,6 +272,7 @@ class SafePolicyTraining:
             if clip is not None:
                 nn.utils.clip_grad_norm_(parameters, clip)
             adam.step()
+            self._after_step()
             cycle.step()
             if updater is not None:
                 updater.step()
@@ -290,6 +295,9 @@ class SafePolicyTraining:
                     "delayed": None if delayed is None else delayed.state_dict(),
                 }
                 self._checkpoint()
+
+    def _after_step(self) -> None:
+        """What follows every step of an optimiser; nothing here."""
 
     def _pick(self, n: int, size: int) -> Tensor:
         return torch.randint(n, (size,), generator=self.generator)
@@ -420,6 +428,7 @@ class SafePolicyTraining:
             if c is not None:
                 z, index = torch.cat([z, tube[c]]), torch.cat([a, base[c]])
             error = (self.dynamics(z, data["action"][index]) - data["next_latent"][index]).square().sum(-1)
+            error = torch.where(data["region"][index, 0] == UNSAFE, s.unsafe_weight * error, error)
             return TensorDict(
                 loss_consistency=error.mean() + 0.2 * error.topk(max(1, len(error) // 20)).values.mean(),
                 dynamics_error_max=error.detach().max().sqrt(),
@@ -430,6 +439,26 @@ class SafePolicyTraining:
             {self.dynamics: 3e-3 if number == 0 else 2e-3},
             step,
         )
+
+    def _phase_teach(self, number: int) -> None:
+        """The policy alone, on the values of its actions; what it then keeps is what the barrier is taught."""
+        s, data = self.config.synthesis, self.latents
+        g = torch.Generator().manual_seed(self.config.seed + 99_000 + number)
+        z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
+        actions = self._action_grid(s.actions)
+        _, axes = self._errors(z, g, s.teach_spread)
+        successors = self._successors(z, actions)
+        value = safety_values(successors, z, signed_margin(z, unsafe), residuals=axes)
+        # In U nothing can be kept any more: the soonest way out.
+        times = reach_times(successors[unsafe], z[unsafe], z[~unsafe])
+        value[unsafe] = -_VALUE_SCALE * times
+        table = TensorDict(latent=z, action_value=value, batch_size=[len(z)])
+        loss = ActionValueLoss(
+            self.policy, action_scale=self.env.max_action, scale=_VALUE_SCALE, worst_coeff=0.3, worst_fraction=0.05
+        )
+        steps = s.teach_steps if number == 0 else s.teach_steps // 2
+        self._loop(steps, {self.policy: 3e-3}, lambda: loss(table[self._pick(len(table), s.batch)]))
+        self.taught = copy.deepcopy(self.policy).requires_grad_(False)
 
     def _phase_fit(self, number: int) -> None:
         """Barrier and policy onto the robust invariant set of the encoded data."""
@@ -541,10 +570,10 @@ class SafePolicyTraining:
         agent = self._agent(0.0)
         env, n = self.env, s.check_episodes
         hardest = self._hardest_unsafe(agent, 2 * n, generator)
-        unsafe_states = torch.cat([env.unsafe_set.sample(2 * n, generator=generator), hardest])
+        unsafe_states = torch.cat([env.sample_states(2 * n, generator, region=env.unsafe_set), hardest])
         unsafe = agent.barrier(encode_states(agent, env, unsafe_states))[:, 0]
-        safe = agent.barrier(encode_states(agent, env, env.safe_set.sample(n, generator=generator)))[:, 0]
-        states = self._buffer_region().sample(3 * n, generator=generator)
+        safe = agent.barrier(encode_states(agent, env, env.sample_states(n, generator, region=env.safe_set)))[:, 0]
+        states = env.sample_states(3 * n, generator, region=self._buffer_region())
         value = agent.barrier(encode_states(agent, env, states))[:, 0]
         start = states[value <= _HIGHEST_LEVEL][:n]
         if not len(start):
@@ -554,7 +583,7 @@ class SafePolicyTraining:
         touches = env.unsafe_set.contains(episodes.states)
         after = episodes.barrier[1:]
         late = touches.flip(0).cumsum(0).flip(0) > 0
-        back = rollout(agent, env, env.unsafe_set.sample(n // 4, generator=generator), 2 * s.check_horizon)
+        back = rollout(agent, env, env.sample_states(n // 4, generator, region=env.unsafe_set), 2 * s.check_horizon)
 
         def check(level: float) -> Check:
             bad = int((unsafe <= level + s.guard).sum())
@@ -613,46 +642,18 @@ class SafePolicyTraining:
             return self._target_table, self._rim
         s, data = self.config.synthesis, self.latents
         g = torch.Generator().manual_seed(self.config.seed + 88_000 + number)
-        z, region = data["latent"], data["region"][:, 0]
-        actions = self._action_grid(s.actions)
-        unsafe = region == UNSAFE
-        allowed = ~unsafe
-        zc = z[allowed]
-        with torch.no_grad():
-            residual = data["next_latent"] - self.dynamics(z, data["action"])
-        sample = torch.randperm(len(z), generator=g)[:30000]
-        near, axes = nearby_residuals(
-            zc, z[sample], residual[sample], count=s.residuals, spread=s.residual_spread
-        )
-        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], residuals=axes)
-        kept = found.inside
-        if not bool(kept.any()):
-            # Nothing can be kept under these errors: go on with what can be kept longest, and let the held-out
-            # checks say what it is worth.
-            kept = found.removed == found.removed.max()
-        inside = torch.zeros(len(z), dtype=torch.bool)
-        inside[allowed.nonzero()[:, 0]] = kept
+        z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
+        zc = z[~unsafe]
+        near, axes = self._errors(zc, g, s.residual_spread)
         stray = torch.rand(60000, z.shape[1], generator=g) * 2 - 1
         far = nearest_distance(stray, self._cloud(g)) > s.tube_radius
         tube, _ = self._tube(z, 2 * s.tube_radius, 1000 + number)
         rim, rows = self._tube(zc, 1.2 * s.tube_radius, 2000 + number)
         queries = torch.cat([z, data["next_latent"], tube, stray])
-        target, member = barrier_targets(
-            queries,
-            z[inside],
-            torch.cat([z[~inside], stray[far]]),
-            tube_radius=s.tube_radius,
-            lipschitz_bound=self.config.network.lipschitz_bound,
-        )
-        # Actions: inside, what keeps the largest clearance; outside, what leads back soonest.
-        best = torch.zeros(len(z), self.env.action_dim)
-        keep = torch.softmax(found.clearance[kept] / 0.01, 1) @ actions
-        best[inside] = keep
-        outer = (~inside).nonzero()[:, 0]
-        times = reach_times(self._successors(z[outer], actions), z[outer], z[inside], known_within=_KNOWN_WITHIN)
-        best[outer] = torch.softmax(-times / 0.1, 1) @ actions
-        weight = torch.ones(len(z))
-        weight[outer] = (times.min(1).values < 100).float()
+        if s.teacher == "value":
+            target, member, best, weight = self._value_targets(queries, axes)
+        else:
+            target, member, best, weight = self._clearance_targets(queries, stray[far], axes)
         rest = len(queries) - len(z)
         self._target_table = TensorDict(
             latent=queries,
@@ -667,8 +668,68 @@ class SafePolicyTraining:
             latent=torch.cat([zc, rim]), residual=torch.cat([near, near[rows]]), batch_size=[len(zc) + len(rim)]
         )
         self._target_round = number
-        self._log({"step": number, "inside_of_allowed": float(found.inside.float().mean()), "sweeps": found.iterations})
         return self._target_table, self._rim
+
+    def _clearance_targets(self, queries: Tensor, stray: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
+        """Signed distance to the robust invariant set; actions that keep the largest clearance, or lead back soonest."""
+        s, data = self.config.synthesis, self.latents
+        z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
+        zc, actions = z[~unsafe], self._action_grid(s.actions)
+        found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], residuals=errors)
+        kept = found.inside
+        if not bool(kept.any()):
+            # Nothing can be kept under these errors: go on with what can be kept longest, and let the held-out
+            # checks say what it is worth.
+            kept = found.removed == found.removed.max()
+        inside = torch.zeros(len(z), dtype=torch.bool)
+        inside[(~unsafe).nonzero()[:, 0]] = kept
+        target, member = barrier_targets(
+            queries,
+            z[inside],
+            torch.cat([z[~inside], stray]),
+            tube_radius=s.tube_radius,
+            lipschitz_bound=self.config.network.lipschitz_bound,
+        )
+        best = torch.zeros(len(z), self.env.action_dim)
+        best[inside] = torch.softmax(found.clearance[kept] / 0.01, 1) @ actions
+        outer = (~inside).nonzero()[:, 0]
+        times = reach_times(self._successors(z[outer], actions), z[outer], z[inside], known_within=_KNOWN_WITHIN)
+        best[outer] = torch.softmax(-times / 0.1, 1) @ actions
+        weight = torch.ones(len(z))
+        weight[outer] = (times.min(1).values < 100).float()
+        self._log({"step": 0, "inside_of_allowed": float(found.inside.float().mean()), "sweeps": found.iterations})
+        return target, member, best, weight
+
+    @torch.no_grad()
+    def _value_targets(self, queries: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
+        """Minus the margin that the taught policy keeps, and the taught policy itself."""
+        s, data = self.config.synthesis, self.latents
+        assert self.taught is not None
+        z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
+        action = self.taught(z)
+        # What looks unsafe ends there, whatever follows: no errors are needed for it.
+        around = torch.zeros(len(z), *errors.shape[1:])
+        around[~unsafe] = errors
+        margin = signed_margin(z, unsafe)
+        value = safety_values(self.dynamics(z, action)[:, None], z, margin, residuals=around)[:, 0].minimum(margin)
+        target = value_targets(
+            queries,
+            z,
+            value,
+            tube_radius=s.tube_radius,
+            lipschitz_bound=self.config.network.lipschitz_bound,
+        )
+        self._log({"step": 0, "inside_of_allowed": float((value[~unsafe] > 0).float().mean())})
+        return target, target <= 0, action, torch.ones(len(z))
+
+    def _errors(self, latent: Tensor, generator: torch.Generator, spread: float) -> tuple[Tensor, Tensor]:
+        """Errors of the dynamics observed near latents: a sample of them, and their principal axis."""
+        data = self.latents
+        z = data["latent"]
+        with torch.no_grad():
+            residual = data["next_latent"] - self.dynamics(z, data["action"])
+        sample = torch.randperm(len(z), generator=generator)[:30000]
+        return nearby_residuals(latent, z[sample], residual[sample], count=self.config.synthesis.residuals, spread=spread)
 
     def _action_grid(self, per_dimension: int) -> Tensor:
         axis = torch.linspace(-self.env.max_action, self.env.max_action, per_dimension)
@@ -779,6 +840,7 @@ class SafePolicyTraining:
             "networks": self.networks.state_dict(),
             "latents": self.latents,
             "counterexamples": self.counterexamples,
+            "taught": None if self.taught is None else self.taught.state_dict(),
             "best": self.best,
             "checks": [vars(c) for c in self.checks],
             "generator": self.generator.get_state(),
@@ -811,6 +873,9 @@ class SafePolicyTraining:
         self.networks.load_state_dict(body["networks"])
         self.latents, self.best = body["latents"], body["best"]
         self.counterexamples = body["counterexamples"]
+        if body["taught"] is not None:
+            self.taught = copy.deepcopy(self.policy).requires_grad_(False)
+            self.taught.load_state_dict(body["taught"])
         self.checks = [Check(**c) for c in body["checks"]]
         self.generator.set_state(body["generator"])
         self.phase, self.step, self.seconds = body["phase"], body["step"], body["seconds"]

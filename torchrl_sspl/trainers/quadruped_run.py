@@ -11,9 +11,11 @@ from typing import Any
 
 from tqdm import tqdm
 
+from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.errors import MissingDependencyError
 from torchrl_sspl.modules.agent import Agent, agent_directory, load
+from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, certify
 from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.evaluation import Evaluation, Measurement
 from torchrl_sspl.trainers.pipeline import Check
@@ -47,6 +49,7 @@ class QuadrupedOutcome:
         directory: where everything lies.
         agent: the agent.
         evaluation: all measurements.
+        certificate: what is proved, measured and assumed about the agent; None where it came without one.
         report: the page, or None where matplotlib is missing.
         notes: what was not done, and why.
     """
@@ -54,6 +57,7 @@ class QuadrupedOutcome:
     directory: Path
     agent: Agent
     evaluation: Evaluation
+    certificate: Certificate | None
     report: Path | None
     notes: list[str]
 
@@ -65,6 +69,8 @@ class QuadrupedOutcome:
             value = "not measured" if m is None or m.value is None else format_value(m.value, m.unit)
             n = f" (n = {m.n:,})" if m is not None and m.n else ""
             lines.append(f"{r.label:<52} {value + n:<26} must {r.sense} {r.must:<6g} {r.verdict(self.evaluation)}")
+        if self.certificate is not None:
+            lines += [f"certificate, {layer.name} layer: {layer.verdict}" for layer in self.certificate.layers.values()]
         return "\n".join([*lines, *self.notes])
 
 
@@ -102,32 +108,44 @@ def make_physics(model: DubinsEnv) -> Callable[[], Any]:
 
 
 def run_quadruped(
-    config: TrainingConfig, make_env: Callable[[list[int], int], DubinsEnv], task: QuadrupedRun | None = None
+    config: TrainingConfig,
+    make_env: Callable[[list[int], int], DubinsEnv],
+    task: QuadrupedRun | None = None,
+    *,
+    make_training_env: Callable[[list[int], int], DubinsEnv] | None = None,
 ) -> QuadrupedOutcome:
     """Train or load an agent, evaluate it on the Dubins car and in full physics, and report.
 
     Args:
         config: everything that determines training and evaluation; ``out_dir`` is where all is written.
-        make_env: ``(batch_size, seed) -> DubinsEnv``.
+        make_env: ``(batch_size, seed) -> DubinsEnv`` without a yaw lag, on which the agent is evaluated.
         task: what is done apart from the training.
+        make_training_env: the car on which the agent is trained and certified, which may turn late as the walking robot
+            does; default ``make_env``.
 
     Returns:
-        The outcome; ``metrics.json``, ``figures/`` and ``report.html`` are on disk, after a training ``agent/`` too.
+        The outcome; ``metrics.json``, ``figures/`` and ``report.html`` are on disk, after a training ``agent/`` with its
+        certificate too.
 
-    Source: paper Section IV-B.
+    Source: paper Section IV-B. Deviation: trained on the car that turns late, because the robot does.
     """
     task = task or QuadrupedRun()
     directory = Path(config.out_dir)
     directory.mkdir(parents=True, exist_ok=True)
     env = make_env([1], config.seed)
     evaluation, notes = Evaluation(), []
+    certificate: Certificate | None
     if task.agent is None:
-        result = train(config, make_env)
+        make_training_env = make_training_env or make_env
+        result = train(config, make_training_env)
         agent, checks = result.agent, list(result.checks)
+        certificate = _certify(agent, make_training_env([1], config.seed), config)
         notes.append(f"Training took {result.seconds:.0f} s. Why it ended: {result.stop_reason}.")
         evaluation.add(Measurement("training_minutes", result.seconds / 60, "min", note="wall clock, data included"))
     else:
         agent, checks = load(task.agent), []
+        beside = agent_directory(task.agent) / CERTIFICATE_FILE
+        certificate = Certificate.load(beside) if beside.is_file() else None
         notes += _trained_before(task.agent, evaluation, checks)
     if task.dubins:
         found = evaluate_dubins(agent, env, config.evaluation, progress=config.progress)
@@ -143,7 +161,7 @@ def run_quadruped(
             film = _film(agent, env, make, task.walks.seconds)
         except MissingDependencyError as error:
             notes.append(f"Not evaluated in full physics: {error}")
-    outcome = QuadrupedOutcome(directory, agent, evaluation, None, notes)
+    outcome = QuadrupedOutcome(directory, agent, evaluation, certificate, None, notes)
     _write_metrics(outcome, config, checks, task)
     try:
         from torchrl_sspl.viz.quadruped import write_quadruped_report
@@ -159,10 +177,26 @@ def run_quadruped(
             checks=checks,
             film=film,
             notes="\n\n".join(notes),
+            certificate=certificate,
         )
     except MissingDependencyError as error:
         tqdm.write(f"no figures and no report: {error}")
     return outcome
+
+
+def _certify(agent: Agent, env: DubinsEnv, config: TrainingConfig) -> Certificate:
+    """Issue the certificate of a trained agent and keep it beside it."""
+    path = Path(config.out_dir) / "agent" / CERTIFICATE_FILE
+    certificate = certify(
+        agent,
+        env,
+        name=Path(config.out_dir).name,
+        episodes=config.evaluation.certificate_episodes,
+        horizon=config.evaluation.horizon,
+        progress=config.progress,
+    )
+    certificate.save(path)
+    return certificate
 
 
 def _trained_before(name: str, evaluation: Evaluation, checks: list[Any]) -> list[str]:

@@ -1,0 +1,125 @@
+"""The loss that teaches the policy the best of tabulated action values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import torch
+from tensordict import NestedKey, TensorDict, TensorDictBase
+from tensordict.nn import dispatch
+from torch import Tensor, nn
+
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.objectives.base import LatentLoss
+
+
+def interpolate(table: Tensor, action: Tensor, *, action_scale: float) -> Tensor:
+    r"""Values of actions between those of a regular grid, by multilinear interpolation.
+
+    Args:
+        table: ``(n, k^m)`` values of the grid with k points per dimension from ``-action_scale`` to ``action_scale``,
+            in the order of ``torch.cartesian_prod``.
+        action: ``(n, m)`` in physical units; clamped to the grid.
+        action_scale: largest action.
+
+    Returns:
+        ``(n, 1)`` values, differentiable in the actions.
+
+    Raises:
+        ShapeError: if the table does not have ``k^m`` columns for some k of at least 2.
+
+    Source: none.
+
+    Example:
+        >>> interpolate(torch.tensor([[0.0, 1.0, 4.0]]), torch.tensor([[0.5]]), action_scale=1.0)
+        tensor([[2.5000]])
+    """
+    dims, columns = action.shape[-1], table.shape[-1]
+    k = round(columns ** (1 / dims))
+    if k < 2 or k**dims != columns:
+        raise ShapeError(
+            f"expected the values of a grid with k >= 2 points in each of {dims} dimensions, received {columns} columns"
+        )
+    place = (action / action_scale + 1) / 2 * (k - 1)
+    low = place.detach().floor().clamp(0, k - 2)
+    share = (place - low).clamp(0.0, 1.0)
+    powers = torch.tensor([k ** (dims - 1 - d) for d in range(dims)], device=action.device)
+    value = torch.zeros_like(table[..., :1])
+    for corner in product((0, 1), repeat=dims):
+        upper = torch.tensor(corner, device=action.device)
+        index = ((low.long() + upper) * powers).sum(-1, keepdim=True)
+        weight = torch.where(upper.bool(), share, 1 - share).prod(-1, keepdim=True)
+        value = value + weight * table.gather(-1, index)
+    return value
+
+
+class ActionValueLoss(LatentLoss):
+    r"""Teaches the policy the action of the largest tabulated value.
+
+    .. math:: L = \operatorname{mean} w \, (\max_u Q(z, u) - Q(z, \pi(z))) / s
+
+    with Q between the tabulated actions by multilinear interpolation. Where two actions are as good and what lies
+    between them is not, as left and right of an obstacle ahead, a regression onto the mean of the best would teach the
+    worst; this loss decides for a side. Where the action does not matter it asks for nothing.
+
+    Args:
+        policy: latent -> action ``(*batch, action_dim)`` in physical units.
+        action_scale: largest action, end of the grid of actions.
+        scale: s, in units of the values.
+        **shared: ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`.
+
+    Returns:
+        ``forward`` returns a tensordict with ``loss_action_value``.
+
+    Raises:
+        ConfigError: if an option is not valid, or an entry of the batch is missing.
+        ShapeError: if the table does not fit the action.
+
+    Source: none; the paper trains the policy on the condition alone.
+
+    Example:
+        >>> from torchrl_sspl.modules import Policy
+        >>> loss = ActionValueLoss(Policy(2, 1))
+        >>> rows = TensorDict(latent=torch.rand(4, 2), action_value=torch.rand(4, 11), batch_size=4)
+        >>> loss(rows)["loss_action_value"].shape
+        torch.Size([])
+    """
+
+    @dataclass
+    class _AcceptedKeys(LatentLoss._AcceptedKeys):
+        """Keys that can be changed with ``set_keys``.
+
+        Attributes:
+            action_value: ``(*batch, k^m)`` values of a regular grid of actions.
+        """
+
+        action_value: NestedKey = "action_value"
+
+    tensor_keys: _AcceptedKeys
+    default_keys = _AcceptedKeys
+
+    def __init__(self, policy: nn.Module, *, action_scale: float = 1.0, scale: float = 1.0, **shared: Any) -> None:
+        if not action_scale > 0 or not scale > 0:
+            raise ConfigError(f"expected action_scale and scale > 0, received {action_scale} and {scale}")
+        super().__init__(policy=policy, **shared)
+        self.action_scale, self.scale = float(action_scale), float(scale)
+        self.out_keys.append("loss_action_value")
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        assert self._in_keys is not None
+        self._in_keys.append(self.tensor_keys.action_value)
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss on a batch of latents with the values of their actions; the batch is not changed."""
+        batch = self._read(tensordict)
+        table = self._counted(tensordict, self.tensor_keys.action_value, "action_value", batch)
+        action = self._run("actor_network", batch.latent)
+        short = table.amax(-1, keepdim=True) - interpolate(table, action, action_scale=self.action_scale)
+        return self._pack({"loss_action_value": self._reduce(short / self.scale, batch, worst=True)}, tensordict)
+
+
+__all__ = ["ActionValueLoss", "interpolate"]
