@@ -227,13 +227,20 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
                 "evaluate_episodes(agent, make_env) there"
             )
         return evaluate_episodes(agent, EnvFactory(experiment["env"]), config)
-    from torchrl_sspl.envs import PendulumEnv
+    from torchrl_sspl.envs import DubinsEnv, PendulumEnv
     from torchrl_sspl.trainers.evaluation import evaluate as measure
+    from torchrl_sspl.trainers.quadruped import evaluate_dubins
 
-    env = PendulumEnv(batch_size=[1], seed=config.seed)
-    if agent.policy.action_dim != env.action_dim:
-        raise CheckpointError(f"expected the agent in '{directory}' to be one of the pendulum, found another system's")
-    return measure(agent, env, config, progress=sys.stderr.isatty())
+    measures = {"PendulumEnv": (PendulumEnv, measure), "DubinsEnv": (DubinsEnv, evaluate_dubins)}
+    named = body.get("environment", "PendulumEnv")
+    if named not in measures:
+        raise CheckpointError(
+            f"expected the agent in '{directory}' to be trained on one of {', '.join(measures)}, found '{named}'; "
+            "call evaluate(agent, env) in your own code"
+        )
+    make, judge = measures[named]
+    env = make(batch_size=[1], seed=config.seed)
+    return judge(agent, env, config, progress=sys.stderr.isatty())
 
 
 def verify(words: list[str]) -> int:

@@ -145,9 +145,9 @@ def deterministic_layer(
         detail=detail,
     )
 
-    found = largest_error(system, level=level, tolerance=tolerance, budget=budget)
-    enough = found.delta >= required_error and found.delta > 0.0
     if kept.status == "proved":
+        found = largest_error(system, level=level, tolerance=tolerance, budget=budget)
+        enough = found.delta >= required_error and found.delta > 0.0
         state(
             "tolerated error",
             "the same, whatever error of at most this is added to d(z, pi(z))",

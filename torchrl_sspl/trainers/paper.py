@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import torch
-from tensordict import TensorDict
 from torch import nn
 
 from torchrl_sspl.data import TransitionStore, collect_rollouts

@@ -796,6 +796,7 @@ class SafePolicyTraining:
                 "barrier": {"latent_dim": net.latent_dim, "hidden": net.barrier_hidden},
             },
             "training": self.config.to_dict(),
+            "environment": type(env).__name__,
         }
 
     def _result(self) -> TrainingResult:
