@@ -27,6 +27,7 @@ def certificate_section(certificate: Certificate) -> str:
     Source: none.
 
     Example:
+        >>> from torchrl_sspl.certification import Layer
         >>> layer = Layer("deterministic", [Statement("a", "1 < 2", PROVED, True)])
         >>> "1 &lt; 2" in certificate_section(Certificate("demo", "0" * 64, "0" * 64, 0.0, {"deterministic": layer}))
         True
@@ -57,6 +58,7 @@ def proved_lines(certificate: Certificate) -> list[str]:
     Source: none.
 
     Example:
+        >>> from torchrl_sspl.certification import Layer
         >>> layer = Layer("deterministic", [Statement("a", "1 < 2", PROVED, True)])
         >>> proved_lines(Certificate("demo", "", "", 0.0, {"deterministic": layer}))
         ['1 < 2.']

@@ -116,7 +116,7 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "")
     Source: none.
 
     Example:
-        >>> "<td data-label=\"a\">1</td>" in table(["a"], [["1"]])
+        >>> '<td data-label="a">1</td>' in table(["a"], [["1"]])
         True
     """
     top = "".join(f'<th scope="col">{escape(h)}</th>' for h in head)
