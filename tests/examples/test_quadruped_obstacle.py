@@ -9,6 +9,8 @@ from pathlib import Path
 import pytest
 from tiny import TINY
 
+from torchrl_sspl.cli import evaluate_agent
+
 EXAMPLE = Path(__file__).parents[2] / "examples" / "quadruped_obstacle.py"
 SMALL = ["evaluation.grid=7", "evaluation.rollouts=4", "evaluation.horizon=2", "network.pool_to=32", "walks=0"]
 
@@ -42,8 +44,22 @@ def test_a_run_writes_numbers_figures_report_and_agent(trained):
     # An agent of a few steps is no good, and the run says so; nobody claims walks that were not walked.
     assert any(verdict.startswith("missed") for verdict in metrics["verdicts"].values())
     assert metrics["verdicts"]["walks from S that fall"] == "not measured"
-    for name in ("report.html", "agent/agent.safetensors", "agent/evaluation.json", "figures/plane_by_heading.png"):
+    for name in (
+        "report.html", "agent/agent.safetensors", "agent/evaluation.json", "agent/certificate.json",
+        "figures/plane_by_heading.png",
+    ):  # fmt: skip
         assert (directory / name).stat().st_size > 0
+    assert "Certificate" in (directory / "report.html").read_text()
+    # It is trained on the car that turns late, and says so.
+    assert json.loads((directory / "agent" / "agent.json").read_text())["environment"] == "DubinsEnv"
+
+
+def test_the_command_measures_it_on_the_car(trained, monkeypatch):
+    _, directory = trained
+    monkeypatch.setattr("torchrl_sspl.trainers.quadruped.KERNEL_GRID", (31, 31, 24))
+    monkeypatch.setattr("torchrl_sspl.trainers.quadruped.STATE_GRID", (5, 5, 8))
+    found = evaluate_agent(str(directory), ["grid=5", "rollouts=4", "horizon=2"])
+    assert found.measurements["unsafe_called_safe"].n == 5 * 5 * 5
 
 
 def test_a_trained_agent_is_evaluated_without_training(example, trained, tmp_path):
