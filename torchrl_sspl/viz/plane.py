@@ -249,11 +249,13 @@ class Plane:
                 image[region.contains(state).numpy()] = to_rgb(colour)
         shown = state[:, [i, j]].numpy()
         image[((shown < corners[0]) | (shown > corners[1])).any(1)] = to_rgb(OUTSIDE_FILL)
+        units = [name.partition("[")[2] for name in self.names[:2]]
         ax.imshow(
             image.reshape(resolution, resolution, 3),
             extent=extent,
             origin="lower",
-            aspect="auto",
+            # A metre is as long to the right as it is upward.
+            aspect="equal" if units[0] and units[0] == units[1] else "auto",
             interpolation="nearest",
             zorder=0,
         )
