@@ -222,6 +222,11 @@ def verify_run(name: str | Path, *, env: SafetyEnv | None = None, report: Callab
                 if s.n is None
                 else f" (n = {s.n:,}" + (")" if s.confidence is None else f", {100 * s.confidence:g} %)")
             )
-            report(f"    {s.kind:9s} {s.text}{value}{sample}" + (f" [{s.detail}]" if s.detail else ""))
-    report(f"OK: the weights are {claimed.weights[:12]}..., and prove what the certificate of '{claimed.agent}' says")
+            status = "FAILS" if s.holds is False else s.kind
+            missed = "" if s.misses_by is None else f", misses by {s.misses_by:.3g} {s.unit}"
+            report(f"    {status:9s} {s.text}{value}{sample}{missed}" + (f" [{s.detail}]" if s.detail else ""))
+    report(f"OK: the weights are {claimed.weights[:12]}..., and the certificate of '{claimed.agent}' says what they prove")
+    open_layers = [layer.name for layer in claimed.layers.values() if not layer.holds]
+    if open_layers:
+        report(f"What it says is that these layers are not certified: {', '.join(open_layers)}")
     return 0

@@ -264,6 +264,7 @@ def trajectories(
     dt: float | None = None,
     episodes: int = 6,
     arrows: int = 14,
+    lengths: Any | None = None,
     caption: str = "",
 ) -> Figure:
     """Closed-loop trajectories with their actions as arrows, and barrier and action over time.
@@ -281,6 +282,7 @@ def trajectories(
         dt: time step in s; None: the time axis counts steps.
         episodes: trajectories drawn at most, with starts far apart.
         arrows: arrows per trajectory, at most.
+        lengths: ``(n,)`` steps after which each episode was over; None: all steps are drawn.
         caption: what the figure shows.
 
     Returns:
@@ -304,6 +306,7 @@ def trajectories(
         raise ShapeError(f"states: expected shape (T + 1, n, {plane.dim}) with T, n >= 1, received {x.shape}.")
     u = array("actions", actions, (steps, n, None))[..., 0]
     values = None if barrier is None else array("barrier", barrier, (steps + 1, n))
+    last = np.full(n, steps) if lengths is None else array("lengths", lengths, (n,)).astype(int).clip(1, steps)
     extent = np.array([plane.high[k] - plane.low[k] for k in plane.coords])
     chosen = _spread(x[0][:, list(plane.coords)] / extent, min(episodes, n))
     largest = action_scale or max(float(np.abs(u).max()), 1e-12)
@@ -326,13 +329,17 @@ def trajectories(
             handles.append(_line(BARRIER_COLOUR, "B = 0"))
     marker = require("matplotlib.lines").Line2D
     for colour, k in zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True):
-        path = x[:, k][:, list(plane.coords)]
+        path = x[: last[k] + 1, k][:, list(plane.coords)]
         ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.2, zorder=3)
         ax.plot(*path[0], "o", color=colour, markersize=5, markeredgecolor="white", zorder=5)
         at = _spaced(path / extent, arrows)
         along = _directions(path / extent, action_direction)
         length = (
-            0.13 * extent * along * (u[:, k] if action_direction is not None else np.abs(u[:, k]))[:, None] / largest
+            0.13
+            * extent
+            * along
+            * (u[: last[k], k] if action_direction is not None else np.abs(u[: last[k], k]))[:, None]
+            / largest
         )
         ax.quiver(
             *path[at].T,
@@ -361,15 +368,15 @@ def trajectories(
     if values is not None:
         upper = figure.add_subplot(grid[0, 1])
         for colour, k in colours:
-            upper.plot(time, values[:, k], color=colour, linewidth=1.2)
+            upper.plot(time[: last[k] + 1], values[: last[k] + 1, k], color=colour, linewidth=1.2)
         upper.axhline(0, color=BARRIER_COLOUR, linewidth=1.0, linestyle=":")
-        upper.set(ylabel="B(z)", xlim=(0, time[-1]))
+        upper.set(ylabel="B(z)", xlim=(0, time[last[chosen].max()]))
         upper.tick_params(labelbottom=False)
     lower = figure.add_subplot(grid[1 if values is not None else slice(None), 1])
     for colour, k in colours:
-        lower.step(time[:-1], u[:, k], where="post", color=colour, linewidth=0.8, alpha=0.85)
+        lower.step(time[: last[k]], u[: last[k], k], where="post", color=colour, linewidth=0.8, alpha=0.85)
     lower.axhline(0, color="#999999", linewidth=0.8)
-    lower.set(ylabel=action_name, xlabel="time [s]" if dt else "step", xlim=(0, time[-1]))
+    lower.set(ylabel=action_name, xlabel="time [s]" if dt else "step", xlim=(0, time[last[chosen].max()]))
     return figure
 
 

@@ -242,14 +242,18 @@ def write_quadruped_report(
         region = env.region(arrays["states"][some])
         figures["Latent space"] = latent_space(arrays["latent"][some], region, agent.barrier)
     if "trajectories" in arrays:
+        there = env.state_space.contains(arrays["trajectories"]).sum(0)  # steps up to the end of the arena
+        longest = there.argsort(descending=True)[: max(1, len(there) // 2)]
+        # The last step seen leads out of the arena, where nothing has a barrier value.
         figures["Dubins episodes"] = trajectories(
             plane,
-            arrays["trajectories"],
-            arrays["torques"],
-            arrays["traces"],
+            arrays["trajectories"][:, longest],
+            arrays["torques"][:, longest],
+            arrays["traces"][:, longest],
             action_name=_RATE,
             dt=env.dt,
-            caption="Episodes of the Dubins car that start in {B <= 0}; they end where the arena does.",
+            lengths=there[longest] - 1,
+            caption="Episodes of the Dubins car that start in {B <= 0}, of the longer half; they end where the arena does.",
         )
     if walks:
         figures["Walks in full physics"] = walks_figure(plane, walks)
