@@ -157,8 +157,7 @@ def from_losses() -> set[str]:
     """Keys that the losses can return, with every term on."""
     from torchrl_sspl.lipschitz import LMIBarrier
     from torchrl_sspl.modules import InverseDynamics, LatentDynamics, Policy
-    from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
-    from torchrl_sspl.objectives.target import TargetLoss
+    from torchrl_sspl.objectives import ActionValueLoss, LipschitzLoss, SSPLLoss, TargetLoss
 
     parts = (LatentDynamics(2, 1, (8,)), torch.nn.Linear(2, 1), Policy(2, 1, (8,)))
     everything = dict.fromkeys(
@@ -166,7 +165,10 @@ def from_losses() -> set[str]:
     )
     options = {f"{name}_coeff": weight for name, weight in everything.items()}
     loss = SSPLLoss(None, *parts, inverse_dynamics=InverseDynamics(2, 1), **options)
-    losses = (loss, LipschitzLoss(LMIBarrier(2, (8,))), TargetLoss(parts[1], parts[2], action_scale=1.0))
+    losses = (
+        loss, LipschitzLoss(LMIBarrier(2, (8,))), TargetLoss(parts[1], parts[2], action_scale=1.0),
+        ActionValueLoss(parts[2]),
+    )  # fmt: skip
     return {key for one in losses for key in one.out_keys}
 
 

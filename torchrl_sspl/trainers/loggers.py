@@ -38,6 +38,7 @@ METRICS: Mapping[str, str] = MappingProxyType(
         "loss_lipschitz": "-log det of the matrix that certifies the Lipschitz bound",
         "loss_target": "distance of the barrier from its targets",
         "loss_policy_target": "distance of the policy from its targets",
+        "loss_action_value": "value that the policy's action misses, against the best one",
         # What the losses measure on their batches.
         "dynamics_error": "mean distance of predicted from observed next latent, on the batch",
         "dynamics_error_max": "largest of these distances",
