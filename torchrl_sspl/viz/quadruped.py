@@ -126,7 +126,10 @@ def walks_figure(plane: Plane, walks: Sequence[Any], *, limit: int = 60, caption
         raise ConfigError("walks: expected at least one, received none; set the number of episodes above 0.")
     wrong = [w for w in walks if w.entered or w.hit or w.fallen]
     good = [w for w in walks if not (w.entered or w.hit or w.fallen)]
-    drawn = (wrong + good)[:limit]
+    room = max(0, limit - len(wrong))
+    # Evenly over all of them: walks from S come first, then those from {B <= 0}.
+    spread = min(room, len(good))
+    drawn = wrong[:limit] + [good[k * len(good) // spread] for k in range(spread)]
     figure = new_figure(5.6, 5.6, caption or f"{len(drawn)} of {len(walks)} walks in full physics; dots: where they start.")
     ax = figure.add_subplot()
     points = np.concatenate([array("poses", w.poses, (None, 3))[:, :2] for w in drawn])
