@@ -1,0 +1,64 @@
+"""The shipped agent keeps away from the obstacle on the model and in full physics, and its certificate says the truth."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+import torchrl_sspl as sspl
+from torchrl_sspl.certification import Certificate
+from torchrl_sspl.envs.dubins import YAW_LAG, DubinsEnv
+from torchrl_sspl.modules.agent import agent_directory
+from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, verify_run
+from torchrl_sspl.trainers.evaluation import encode_states, rollout
+from torchrl_sspl.trainers.quadruped import walk
+from torchrl_sspl.trainers.quadruped_run import make_physics
+
+
+@pytest.fixture(scope="module")
+def agent():
+    return sspl.load("quadruped")
+
+
+@pytest.mark.parametrize("yaw_lag", [None, YAW_LAG])
+def test_on_the_model_it_tells_the_labels_apart_and_stays_out_of_the_unsafe_set(agent, yaw_lag):
+    env, generator = DubinsEnv(batch_size=[1], yaw_lag=yaw_lag), torch.Generator().manual_seed(411)
+    unsafe = env.sample_states(400, generator, region=env.unsafe_set)
+    safe = env.sample_states(400, generator, region=env.safe_set)
+    assert bool((agent.barrier(encode_states(agent, env, unsafe)) > 0).all())
+    assert bool((agent.barrier(encode_states(agent, env, safe)) <= 0).all())
+    states = env.sample_states(400, generator, region=env.state_space - env.unsafe_set)
+    inside = states[agent.barrier(encode_states(agent, env, states))[:, 0] <= 0]
+    assert len(inside) > 300
+    episodes = rollout(agent, env, inside, 30)
+    assert not bool(env.unsafe_set.contains(episodes.states).any())
+
+
+@pytest.mark.parametrize("start", [(-1.9, 0.0, 0.0), (1.6, 0.3, 3.1), (0.2, -1.6, 1.6)])
+def test_the_robot_walks_past_an_obstacle_ahead(agent, start):
+    world = make_physics(DubinsEnv(batch_size=[1]))()
+    try:
+        found = walk(agent, world, start, 60)
+    finally:
+        world.close()
+    assert found.left
+    assert not (found.entered)
+    assert not (found.hit)
+    assert not (found.fallen)
+
+
+def test_its_certificate_is_found_again_and_does_not_claim_what_is_not_so(agent):
+    lines: list[str] = []
+    assert verify_run("quadruped", report=lines.append) == 0
+    assert any("FAILS" in line and "counterexample" in line for line in lines)
+    certificate = Certificate.load(agent_directory("quadruped") / CERTIFICATE_FILE)
+    assert not certificate.layers["deterministic"].holds
+
+
+def test_its_evaluation_names_settings_and_seed():
+    body = json.loads((agent_directory("quadruped") / "evaluation.json").read_text())
+    assert body["seed"] == 0
+    assert body["preset"] == "sound"
+    assert body["measurements"]["walks_from_set_enter"]["n"] == 200
