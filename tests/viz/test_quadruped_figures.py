@@ -46,6 +46,14 @@ def test_walks_that_went_wrong_are_drawn_first_and_counted(plane):
         walks_figure(plane, [])
 
 
+def test_walks_of_different_lengths_and_fates_are_drawn_together(plane):
+    short = a_walk()
+    short.poses = short.poses[:2]
+    figure = walks_figure(plane, [a_walk(entered=True), short, a_walk(entered=True)])
+    colours = [line.get_color() for line in figure.axes[0].lines if len(line.get_xdata()) > 1]
+    assert colours.count("#c8372d") == 2
+
+
 def test_film_of_a_walk(plane, tmp_path):
     path = film_of_walk(a_walk(frames=True), tmp_path / "walk.gif", plane=plane)
     assert path.stat().st_size > 0

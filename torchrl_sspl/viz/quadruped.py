@@ -136,7 +136,7 @@ def walks_figure(plane: Plane, walks: Sequence[Any], *, limit: int = 60, caption
     plane.draw(ax, cover=points)
     for k, w in enumerate(drawn):
         path = array("poses", w.poses, (None, 3))[:, :2]
-        colour = "#c8372d" if w in wrong else PATH_COLOURS[k % len(PATH_COLOURS)]
+        colour = "#c8372d" if w.entered or w.hit or w.fallen else PATH_COLOURS[k % len(PATH_COLOURS)]
         ax.plot(*path.T, color=colour, linewidth=1.0)
         ax.plot(*path[0], "o", color=colour, markersize=4, markeredgecolor="white")
     ax.set_aspect("equal")
