@@ -26,6 +26,13 @@ def _tree(points: Tensor):
     return cKDTree(points.detach().cpu().numpy())
 
 
+def _neighbours(queries: Tensor, points: Tensor, count: int, smoothing: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Distance to the nearest point ``(n,)``, nearest points ``(n, count)``, inverse of their distances (not normalised)."""
+    distance, found = _tree(points).query(queries.detach().cpu().numpy(), k=range(1, count + 1))
+    near = torch.as_tensor(distance, dtype=torch.float32)
+    return near[:, 0], torch.as_tensor(found), 1.0 / (near + smoothing)
+
+
 def nearest_distance(queries: Tensor, points: Tensor) -> Tensor:
     """Euclidean distance of every query to the nearest of the points.
 
@@ -360,9 +367,8 @@ def safety_values(
         )
     errors = torch.zeros(n, 1, p) if residuals is None else residuals
     ends = (successors[:, :, None] + errors[:, None]).reshape(-1, p)
-    distance, found = _tree(latent).query(ends.detach().cpu().numpy(), k=range(1, neighbours + 1))
-    index = torch.as_tensor(found).reshape(n, k, -1, neighbours)
-    weight = 1.0 / (torch.as_tensor(distance, dtype=torch.float32).reshape(index.shape) + smoothing)
+    _, found, inverse = _neighbours(ends, latent, neighbours, smoothing)
+    index, weight = found.reshape(n, k, -1, neighbours), inverse.reshape(n, k, -1, neighbours)
     weight = weight / weight.sum(-1, keepdim=True)
     value = margin
     for _ in range(horizon):
@@ -435,8 +441,6 @@ def value_targets(
         >>> value_targets(torch.tensor([[0.0], [0.5]]), data, value, tube_radius=0.3, lipschitz_bound=1.0, neighbours=1)
         tensor([-0.2000,  0.2000])
     """
-    distance, found = _tree(latent).query(queries.detach().cpu().numpy(), k=range(1, neighbours + 1))
-    near = torch.as_tensor(distance, dtype=torch.float32)
-    weight = 1.0 / (near + smoothing)
-    mean = (value[torch.as_tensor(found)] * weight).sum(-1) / weight.sum(-1)
-    return torch.maximum(-mean, lipschitz_bound * (near[:, 0] - tube_radius))
+    distance, found, weight = _neighbours(queries, latent, neighbours, smoothing)
+    mean = (value[found] * weight).sum(-1) / weight.sum(-1)
+    return torch.maximum(-mean, lipschitz_bound * (distance - tube_radius))

@@ -51,7 +51,7 @@ class PaperTraining(SafePolicyTraining):
         """The separate step on L_M; both it and the step before are pulled back into the cone where they would leave it."""
         barrier = self.warm_barrier
         # Feasible at the start, after every step, and so in every checkpoint.
-        before = self._feasible_state
+        before = {k: self._feasible_state[k].to(v.device) for k, v in barrier.state_dict().items()}
         barrier.backtracking_step(before)  # type: ignore[operator]
         loss = barrier.loss() * 1e-3  # type: ignore[operator]
         gradients = torch.autograd.grad(loss, list(barrier.parameters()), allow_unused=True)

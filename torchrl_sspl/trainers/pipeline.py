@@ -646,14 +646,13 @@ class SafePolicyTraining:
         zc = z[~unsafe]
         near, axes = self._errors(zc, g, s.residual_spread)
         stray = torch.rand(60000, z.shape[1], generator=g) * 2 - 1
-        far = nearest_distance(stray, self._cloud(g)) > s.tube_radius
         tube, _ = self._tube(z, 2 * s.tube_radius, 1000 + number)
         rim, rows = self._tube(zc, 1.2 * s.tube_radius, 2000 + number)
         queries = torch.cat([z, data["next_latent"], tube, stray])
         if s.teacher == "value":
             target, member, best, weight = self._value_targets(queries, axes)
         else:
-            target, member, best, weight = self._clearance_targets(queries, stray[far], axes)
+            target, member, best, weight = self._clearance_targets(queries, stray, axes, g)
         rest = len(queries) - len(z)
         self._target_table = TensorDict(
             latent=queries,
@@ -670,7 +669,9 @@ class SafePolicyTraining:
         self._target_round = number
         return self._target_table, self._rim
 
-    def _clearance_targets(self, queries: Tensor, stray: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
+    def _clearance_targets(
+        self, queries: Tensor, stray: Tensor, errors: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, ...]:
         """Signed distance to the robust invariant set; actions that keep the largest clearance, or lead back soonest."""
         s, data = self.config.synthesis, self.latents
         z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
@@ -683,10 +684,11 @@ class SafePolicyTraining:
             kept = found.removed == found.removed.max()
         inside = torch.zeros(len(z), dtype=torch.bool)
         inside[(~unsafe).nonzero()[:, 0]] = kept
+        far = nearest_distance(stray, self._cloud(generator)) > s.tube_radius
         target, member = barrier_targets(
             queries,
             z[inside],
-            torch.cat([z[~inside], stray]),
+            torch.cat([z[~inside], stray[far]]),
             tube_radius=s.tube_radius,
             lipschitz_bound=self.config.network.lipschitz_bound,
         )

@@ -15,12 +15,12 @@ from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.errors import MissingDependencyError
 from torchrl_sspl.modules.agent import Agent, agent_directory, load
-from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, certify
+from torchrl_sspl.trainers.certify import CERTIFICATE_FILE
 from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.evaluation import Evaluation, Measurement
 from torchrl_sspl.trainers.pipeline import Check
 from torchrl_sspl.trainers.quadruped import QUADRUPED, Walk, WalkConfig, evaluate_dubins, evaluate_walks, walk
-from torchrl_sspl.trainers.run import METRICS_FILE, train
+from torchrl_sspl.trainers.run import METRICS_FILE, certify_run, train
 from torchrl_sspl.viz.report import format_value
 
 _PHYSICS = "torchrl_sspl.envs.quadruped.env"
@@ -139,7 +139,7 @@ def run_quadruped(
         make_training_env = make_training_env or make_env
         result = train(config, make_training_env)
         agent, checks = result.agent, list(result.checks)
-        certificate = _certify(agent, make_training_env([1], config.seed), config)
+        certificate = certify_run(agent, make_training_env([1], config.seed), config)
         notes.append(f"Training took {result.seconds:.0f} s. Why it ended: {result.stop_reason}.")
         evaluation.add(Measurement("training_minutes", result.seconds / 60, "min", note="wall clock, data included"))
     else:
@@ -182,21 +182,6 @@ def run_quadruped(
     except MissingDependencyError as error:
         tqdm.write(f"no figures and no report: {error}")
     return outcome
-
-
-def _certify(agent: Agent, env: DubinsEnv, config: TrainingConfig) -> Certificate:
-    """Issue the certificate of a trained agent and keep it beside it."""
-    path = Path(config.out_dir) / "agent" / CERTIFICATE_FILE
-    certificate = certify(
-        agent,
-        env,
-        name=Path(config.out_dir).name,
-        episodes=config.evaluation.certificate_episodes,
-        horizon=config.evaluation.horizon,
-        progress=config.progress,
-    )
-    certificate.save(path)
-    return certificate
 
 
 def _trained_before(name: str, evaluation: Evaluation, checks: list[Any]) -> list[str]:

@@ -131,15 +131,7 @@ def run(
     training = train(config, make_env, logger=logger)
     env = make_env([1], config.seed)
     own, other = assess(training.agent, env, config.evaluation, foreign, progress=config.progress)
-    certificate = certify(
-        training.agent,
-        env,
-        name=directory.name,
-        episodes=config.evaluation.certificate_episodes,
-        horizon=config.evaluation.horizon,
-        progress=config.progress,
-    )
-    certificate.save(directory / "agent" / CERTIFICATE_FILE)
+    certificate = certify_run(training.agent, env, config)
     outcome = RunOutcome(directory, training, own, other, certificate, requirements, None)
     write_metrics(outcome, config)
     try:
@@ -149,6 +141,32 @@ def run(
         return outcome
     outcome.report = write_run_report(outcome, config, env, title=title, axes=axes, action=action)
     return outcome
+
+
+def certify_run(agent: Agent, env: SafetyEnv, config: TrainingConfig) -> Certificate:
+    """Issue the certificate of a run's agent and keep it beside the agent.
+
+    Args:
+        agent: the trained agent.
+        env: the system that it was trained on.
+        config: of the run.
+
+    Returns:
+        The certificate.
+
+    Source: none.
+    """
+    directory = Path(config.out_dir)
+    certificate = certify(
+        agent,
+        env,
+        name=directory.name,
+        episodes=config.evaluation.certificate_episodes,
+        horizon=config.evaluation.horizon,
+        progress=config.progress,
+    )
+    certificate.save(directory / "agent" / CERTIFICATE_FILE)
+    return certificate
 
 
 def assess(

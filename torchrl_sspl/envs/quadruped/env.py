@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from torchrl_sspl.envs.base import check_positive
 from torchrl_sspl.envs.quadruped.camera import TopCamera
 from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
 from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
@@ -80,18 +81,15 @@ class QuadrupedEnv(gymnasium.Env):
         meshes: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        numbers = {
-            "max_yaw_rate": max_yaw_rate,
-            "speed": speed,
-            "dt": dt,
-            "arena_half_size": arena_half_size,
-            "safe_half_size": safe_half_size,
-            "unsafe_half_size": unsafe_half_size,
-            "obstacle_half_size": obstacle_half_size,
-        }
-        for name, value in numbers.items():
-            if not math.isfinite(value) or value <= 0:
-                raise ConfigError(f"{name}: expected a positive finite number, received {value!r}.")
+        check_positive(
+            max_yaw_rate=max_yaw_rate,
+            speed=speed,
+            dt=dt,
+            arena_half_size=arena_half_size,
+            safe_half_size=safe_half_size,
+            unsafe_half_size=unsafe_half_size,
+            obstacle_half_size=obstacle_half_size,
+        )
         if not obstacle_half_size <= unsafe_half_size < safe_half_size:
             raise ConfigError(
                 f"sizes: expected obstacle <= unsafe < safe, received {obstacle_half_size}, {unsafe_half_size}, {safe_half_size}."
