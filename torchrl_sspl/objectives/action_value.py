@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -15,14 +16,14 @@ from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.objectives.base import LatentLoss
 
 
-def interpolate(table: Tensor, action: Tensor, *, action_scale: float) -> Tensor:
+def interpolate(table: Tensor, action: Tensor, *, action_scale: float | Tensor) -> Tensor:
     r"""Values of actions between those of a regular grid, by multilinear interpolation.
 
     Args:
         table: ``(n, k^m)`` values of the grid with k points per dimension from ``-action_scale`` to ``action_scale``,
             in the order of ``torch.cartesian_prod``.
         action: ``(n, m)`` in physical units; clamped to the grid.
-        action_scale: largest action.
+        action_scale: largest action, a number or ``(m,)``.
 
     Returns:
         ``(n, 1)`` values, differentiable in the actions.
@@ -66,7 +67,7 @@ class ActionValueLoss(LatentLoss):
 
     Args:
         policy: latent -> action ``(*batch, action_dim)`` in physical units.
-        action_scale: largest action, end of the grid of actions.
+        action_scale: largest action, end of the grid of actions; a number or one per dimension.
         scale: s, in units of the values.
         **shared: ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`.
 
@@ -99,12 +100,16 @@ class ActionValueLoss(LatentLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    action_scale: Tensor
 
-    def __init__(self, policy: nn.Module, *, action_scale: float = 1.0, scale: float = 1.0, **shared: Any) -> None:
-        if not action_scale > 0 or not scale > 0:
-            raise ConfigError(f"expected action_scale and scale > 0, received {action_scale} and {scale}")
+    def __init__(
+        self, policy: nn.Module, *, action_scale: float | Sequence[float] = 1.0, scale: float = 1.0, **shared: Any
+    ) -> None:
+        if not scale > 0:
+            raise ConfigError(f"expected scale > 0, received {scale}")
         super().__init__(policy=policy, **shared)
-        self.action_scale, self.scale = float(action_scale), float(scale)
+        self.scale = float(scale)
+        self._set_action_scale(action_scale)
         self.out_keys.append("loss_action_value")
 
     def _set_in_keys(self) -> None:

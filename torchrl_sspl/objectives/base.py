@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -230,6 +230,13 @@ class LatentLoss(LossModule):
             self.register_coeff_buffer(name, float(value))
             if value > 0.0:
                 self._active.add(name)
+
+    def _set_action_scale(self, action_scale: float | Sequence[float]) -> None:
+        scale = torch.as_tensor(action_scale, dtype=torch.get_default_dtype())
+        if scale.ndim > 1 or not bool(((scale > 0) & scale.isfinite()).all()):
+            raise ConfigError(f"expected action_scale > 0, a number or one per dimension, received {action_scale!r}")
+        # Not in the state: it belongs to the environment.
+        self.register_buffer("action_scale", scale, persistent=False)
 
     def _add(
         self,

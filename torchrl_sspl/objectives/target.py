@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,7 +36,7 @@ class TargetLoss(LatentLoss):
         policy_coeff: :math:`\kappa`.
         safe_coeff: :math:`\xi_1`, on rows with region code 1.
         unsafe_coeff: :math:`\xi_2`, on rows with region code 2.
-        action_scale: :math:`u_{\max}`, largest action in physical units.
+        action_scale: :math:`u_{\max}`, largest action in physical units, a number or one per dimension.
         **shared: ``safety_margin`` :math:`\psi`, ``worst_coeff``, ``worst_fraction``, ``reduction``; see
             :class:`LatentLoss`.
 
@@ -78,6 +79,7 @@ class TargetLoss(LatentLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    action_scale: Tensor
     safe_coeff: Tensor
     unsafe_coeff: Tensor
     policy_coeff: Tensor
@@ -94,18 +96,17 @@ class TargetLoss(LatentLoss):
         policy_coeff: float = 1.0,
         safe_coeff: float = 0.0,
         unsafe_coeff: float = 0.0,
-        action_scale: float = 1.0,
+        action_scale: float | Sequence[float] = 1.0,
         **shared: Any,
     ) -> None:
-        if not outside_cap > 0 or not scale > 0 or not action_scale > 0:
-            raise ConfigError(
-                f"expected outside_cap, scale and action_scale > 0, received {outside_cap}, {scale}, {action_scale}"
-            )
+        if not outside_cap > 0 or not scale > 0:
+            raise ConfigError(f"expected outside_cap and scale > 0, received {outside_cap} and {scale}")
         super().__init__(barrier=barrier, policy=policy, **shared)
         self._coefficients(
             inside_coeff=inside_coeff, policy_coeff=policy_coeff, safe_coeff=safe_coeff, unsafe_coeff=unsafe_coeff
         )
-        self.outside_cap, self.scale, self.action_scale = float(outside_cap), float(scale), float(action_scale)
+        self.outside_cap, self.scale = float(outside_cap), float(scale)
+        self._set_action_scale(action_scale)
         self._needs |= {"region"}
         self.out_keys += ["loss_target", "loss_policy_target", "loss_safe", "loss_unsafe"]
 

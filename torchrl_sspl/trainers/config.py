@@ -94,15 +94,10 @@ class RepresentationConfig:
 
 
 @dataclass
-class SynthesisConfig:
-    """Barrier, policy and dynamics on latents that stand still, in rounds (Algorithm 1).
+class LatentConfig:
+    """Dynamics, policy and barrier on latents that stand still.
 
     Attributes:
-        rounds: rounds of rollouts, refit, synthesis and fine-tuning; the first uses random-action data alone.
-        transitions: encoded random-action transitions.
-        rollout_transitions: transitions of the policy (with exploration) that every further round adds.
-        mined_unsafe: transitions from the rim of U, where the barrier is lowest, that every further round adds.
-        exploration: standard deviation of the exploration, as a share of the largest action.
         dynamics_steps: optimiser steps of the refit of the latent dynamics.
         unsafe_weight: weight of transitions that start in U in the refit of the dynamics; below 1 where what is seen
             there is not worth the networks' capacity (a robot before the obstacle it stands on).
@@ -127,21 +122,9 @@ class SynthesisConfig:
         counterexamples: latents of the whole domain at which the condition fails that each search adds to the batches of
             the fine-tuning (0: off; the proof has not needed them so far).
         unsafe_margin: hinge margin on labelled unsafe latents.
-        deviation_coeff: weight lambda_3 of the deviation from the user's policy (preset "paper").
         recovery_coeff: weight of the action that leads back, on latents outside the set.
-        guard: barrier value by which every held-out observation of U has to lie outside the set.
-        leave_share: largest share of the held-out episodes that may leave the set; none may touch U.
-        return_share: share of the held-out episodes from U that should end in the set; among sets that pass, one that
-            reaches it is preferred to a larger one that does not.
-        check_episodes: held-out episodes of a round's check.
-        check_horizon: steps of each.
     """
 
-    rounds: int = 2
-    transitions: int = 40000
-    rollout_transitions: int = 20000
-    mined_unsafe: int = 8000
-    exploration: float = 0.15
     dynamics_steps: int = 6000
     unsafe_weight: float = 1.0
     tube_radius: float = 0.3
@@ -160,8 +143,34 @@ class SynthesisConfig:
     lr: float = 1e-3
     counterexamples: int = 0
     unsafe_margin: float = 0.05
-    deviation_coeff: float = 0.01
     recovery_coeff: float = 0.3
+
+
+@dataclass
+class SynthesisConfig(LatentConfig):
+    """Barrier, policy and dynamics in rounds (Algorithm 1); see ``LatentConfig`` for the inherited settings.
+
+    Attributes:
+        rounds: rounds of rollouts, refit, synthesis and fine-tuning; the first uses random-action data alone.
+        transitions: encoded random-action transitions.
+        rollout_transitions: transitions of the policy (with exploration) that every further round adds.
+        mined_unsafe: transitions from the rim of U, where the barrier is lowest, that every further round adds.
+        exploration: standard deviation of the exploration, as a share of the largest action.
+        deviation_coeff: weight lambda_3 of the deviation from the user's policy (preset "paper").
+        guard: barrier value by which every held-out observation of U has to lie outside the set.
+        leave_share: largest share of the held-out episodes that may leave the set; none may touch U.
+        return_share: share of the held-out episodes from U that should end in the set; among sets that pass, one that
+            reaches it is preferred to a larger one that does not.
+        check_episodes: held-out episodes of a round's check.
+        check_horizon: steps of each.
+    """
+
+    rounds: int = 2
+    transitions: int = 40000
+    rollout_transitions: int = 20000
+    mined_unsafe: int = 8000
+    exploration: float = 0.15
+    deviation_coeff: float = 0.01
     guard: float = 0.02
     leave_share: float = 0.00075
     return_share: float = 0.97
