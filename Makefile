@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
+PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
 .PHONY: pendulum quadruped demo test docs wheel release-check clean
 
@@ -38,7 +38,7 @@ $(VENV)/bin/python:
 
 # One stamp per extra: nothing is installed twice, everything again when the requirements change.
 $(VENV)/.%: $(VENV)/bin/python pyproject.toml constraints.txt
-	$(INSTALL) -e '.[$*]'
+	$(PIP_INSTALL) -e '.[$*]'
 	@touch $@
 
 clean:

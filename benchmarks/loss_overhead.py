@@ -62,12 +62,16 @@ def bare_sound(nets: list[nn.Module]) -> Callable[[TensorDict], Tensor]:
         action, region = batch["action"], batch["region"]
         latent, after = encoder.sequence(batch["frames"]).unbind(-2)
         level = barrier(latent)
-        hinge_safe = (level + 0.5).clamp_min(0)[region == 1]
-        hinge_unsafe = (0.5 - level).clamp_min(0)[region == 2]
+        hinge_safe = (level + 0.3).clamp_min(0)[region == 1]
+        hinge_unsafe = (0.3 - level).clamp_min(0)[region == 2]
         error = (dynamics(latent, action) - after).square().sum(-1)
         gap = (inverse(latent, after) - action) / 10.0
         depth = latent.abs().clamp_max(1 - 1e-6).atanh()
-        total = worst(hinge_safe) + worst(hinge_unsafe) + 2.0 * worst(error) + gap.square().mean()
+        total = 0.3 * (worst(hinge_safe) + worst(hinge_unsafe)) + 2.0 * worst(error) + gap.square().mean()
+        covariance = latent.T.cov(correction=0)
+        spread = covariance.diagonal()
+        total = total + 0.5 * (0.5 - (spread + 1e-8).sqrt()).clamp_min(0).mean()
+        total = total + 0.5 * (covariance.square().sum() - spread.square().sum()) / len(covariance)
         total = total + 0.3 * (depth - 1.4722).clamp_min(0).square().mean()
         still = latent.detach()
         origin = torch.stack([still, torch.rand_like(still) * 2 - 1])

@@ -8,6 +8,7 @@ from functools import partial
 
 import gym_pusht  # noqa: F401  registers the environment
 import gymnasium
+import torch
 from torch import nn
 
 from torchrl_sspl.envs import GymnasiumPixels
@@ -22,14 +23,18 @@ def off_centre(info):  # the pusher's larger distance from the middle of the tab
     return abs(info["pos_agent"] - 256).max()
 
 
-class Encoder(nn.Sequential):  # two RGB frames -> a latent in [-1, 1]
+class Encoder(nn.Module):  # two RGB frames -> a latent in [-1, 1]; both through the same network, for the motion
     def __init__(self, latent_dim):
-        see = [nn.AvgPool2d(2), nn.Conv2d(6, 32, 3, 2), nn.ReLU(), nn.Conv2d(32, 32, 3, 2), nn.ReLU(), nn.Flatten()]
-        super().__init__(*see, nn.Linear(800, 128), nn.ReLU(), nn.Linear(128, latent_dim))
+        super().__init__()
+        sizes = ((3, 16), (16, 32), (32, 32))
+        see = [layer for a, b in sizes for layer in (nn.Conv2d(a, b, 3, 2, 1), nn.SiLU())]
+        self.see = nn.Sequential(nn.AvgPool2d(2), *see, nn.Flatten(), nn.LayerNorm(288), nn.Linear(288, 16))
+        self.head = nn.Sequential(nn.Linear(32, 128), nn.SiLU(), nn.Linear(128, latent_dim), nn.Tanh())
 
     def forward(self, pixels):
-        flat = pixels.reshape(-1, *pixels.shape[-3:]).float() / 127.5 - 1
-        return super().forward(flat).tanh().reshape(*pixels.shape[:-3], -1)
+        frames = pixels.unflatten(-3, (2, 3))
+        seen = self.see(frames.flatten(0, -4).float() / 127.5 - 1).unflatten(0, frames.shape[:-3])
+        return self.head(torch.cat([seen[..., 1, :], 4 * (seen[..., 1, :] - seen[..., 0, :])], -1))
 
 
 my_env = partial(

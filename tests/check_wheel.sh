@@ -1,7 +1,7 @@
 #!/bin/sh
 # Installs a wheel into a fresh environment and runs the tests against it, outside the checkout.
 #   sh tests/check_wheel.sh PYTHON DIST [pytest arguments]
-# INSTALL="torch==2.11.0 numpy==1.26.0 ..." puts other versions than those of constraints.txt to the test.
+# VERSIONS="torch==2.11.0 numpy==1.26.0 ..." puts other versions than those of constraints.txt to the test.
 set -eu
 python=$1
 dist=$(cd "$2" && pwd)
@@ -12,9 +12,9 @@ work=$(mktemp -d)
 trap 'rm -rf "$work"' EXIT
 
 "$python" -m venv "$work/venv"
-if [ -n "${INSTALL:-}" ]; then
+if [ -n "${VERSIONS:-}" ]; then
     # shellcheck disable=SC2086
-    "$work/venv/bin/pip" install --quiet --disable-pip-version-check "$wheel[test]" $INSTALL
+    "$work/venv/bin/pip" install --quiet --disable-pip-version-check "$wheel[test]" $VERSIONS
 else
     "$work/venv/bin/pip" install --quiet --disable-pip-version-check -c "$root/constraints.txt" "$wheel[test]"
 fi

@@ -11,3 +11,9 @@ TINY = [
     "network.barrier_hidden=[8,8]", "network.dynamics_hidden=[8]", "network.policy_hidden=[8]",
 ]
 
+
+# Of an experiment: what follows the joint training.
+TINY_SYNTHESIS = [
+    "synthesis.dynamics_steps=4", "synthesis.teach_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=3",
+    "synthesis.tune_steps=3", "synthesis.batch=32", "synthesis.residuals=2", "synthesis.actions=3",
+]  # fmt: skip

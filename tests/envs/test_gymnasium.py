@@ -129,6 +129,24 @@ def test_horizon_truncates_and_gymnasium_terminates():
     assert data["next", "terminated"].flatten().tolist() == [False, False, True]  # one step has passed in the reset
 
 
+def test_repeated_actions_lie_between_two_frames():
+    env = slider(1, action_repeat=3, reset_options={"x": 2.0}, settle=False)
+    data = env.rollout(2, policy=lambda td: td.set("action", torch.full((1, 1), 1.0)))  # each of the three moves by 1
+    assert data["next", "state"].flatten().tolist() == [5.0, 8.0]
+    assert torch.equal(data["next", "pixels"][:, :, :3], data["pixels"][:, :, 3:])
+    short = slider(1, make=lambda: Slider(lifetime=4), action_repeat=3, settle=False).rollout(5)
+    assert short["next", "terminated"].flatten().tolist() == [False, True]
+
+
+def test_episodes_may_go_on_where_gymnasium_ends_them():
+    make = {"make": lambda: Slider(lifetime=3)}
+    data = slider(1, ignore_termination=True, horizon=8, **make).rollout(20)
+    assert not data["next", "terminated"].any()
+    assert data["next", "truncated"].flatten().tolist() == [False] * 7 + [True]
+    with pytest.raises(ConfigError, match=r"horizon.*ignore_termination"):
+        slider(1, ignore_termination=True, **make)
+
+
 def test_ended_environments_restart_alone():
     env = slider(2)
     env.reset()
@@ -154,6 +172,8 @@ def test_what_cannot_work_is_refused():
         slider(0)
     with pytest.raises(ConfigError, match="horizon"):
         slider(horizon=0)
+    with pytest.raises(ConfigError, match="action_repeat"):
+        slider(action_repeat=0)
     with pytest.raises(ConfigError, match="image_size"):
         GymnasiumPixels(Slider, safe=bool, unsafe=bool, image_size=2)
 

@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from tiny import TINY_SYNTHESIS
 
 from torchrl_sspl.errors import EmptyRegionError
 from torchrl_sspl.modules import agent as registry
@@ -25,6 +26,7 @@ TINY = [
     "trainer.checkpoint_every=-1", "collector.frames_per_batch=80", "collector.envs=4", "collector.init_random_frames=80",
     "network.barrier_hidden=[8]", "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "buffer.batch=16",
     "evaluation.episodes=6", "evaluation.envs=3", "evaluation.horizon=6",
+    *TINY_SYNTHESIS,
 ]  # fmt: skip
 
 

@@ -8,6 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from tensordict import TensorDict
+from tiny import TINY_SYNTHESIS
 from torch import nn
 
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
@@ -17,6 +18,7 @@ from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 from torchrl_sspl.trainers.episodes import Episodes, evaluate_episodes, run_episodes, separating_level
 from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy
 from torchrl_sspl.trainers.experiment_config import EpisodesConfig, experiment_config
+from torchrl_sspl.trainers.latents import LatentTraining
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 
@@ -157,6 +159,7 @@ SMALL = [
     "collector.frames_per_batch=64", "collector.envs=8", "collector.init_random_frames=64", "network.pool_to=8",
     "network.barrier_hidden=[8]", "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "buffer.batch=16",
     "evaluation.episodes=4", "evaluation.envs=4", "evaluation.horizon=4",
+    *TINY_SYNTHESIS,
 ]  # fmt: skip
 
 
@@ -168,14 +171,75 @@ def build(folder, *more: str) -> Experiment:
     return Experiment(experiment_config([*SMALL, *more, f"out_dir={folder}"], **{"logger.kind": "none"}), everywhere)
 
 
-def test_a_stopped_experiment_goes_on_to_the_same_agent(tmp_path):
+class Stopped(Exception):
+    pass
+
+
+def test_a_stopped_experiment_goes_on_to_the_same_agent(tmp_path, monkeypatch):
     straight = build(tmp_path / "straight", "trainer.total_frames=256").train()
-    build(tmp_path / "stopped", "trainer.total_frames=128").train()
+    first = build(tmp_path / "stopped", "trainer.total_frames=256")
+
+    def stop_in_third_batch(batch):
+        if first.trainer.collected_frames > 128:
+            raise Stopped
+        return batch
+
+    first.trainer.register_op("batch_process", stop_in_third_batch)
+    with pytest.raises(Stopped):
+        first.train()
     second = build(tmp_path / "stopped", "trainer.total_frames=256")
-    weights = second.train().state_dict()
+
+    def stop_in_tune(training):
+        if training.phases()[training.phase][0] == "tune":
+            raise Stopped
+
+    with monkeypatch.context() as patch:
+        patch.setattr(LatentTraining, "_after_step", stop_in_tune)
+        with pytest.raises(Stopped):
+            second.train()
     assert second.trainer.collected_frames == 256
+    third = build(tmp_path / "stopped", "trainer.total_frames=256")
+    weights = third.train().state_dict()
+    assert third.trainer.optimization_stepper.count == 2 * 4
     for name, value in straight.state_dict().items():
         assert torch.equal(value, weights[name]), name
+
+
+def test_what_follows_the_joint_training_starts_anew_on_other_data(tmp_path):
+    build(tmp_path, "trainer.total_frames=128").train()
+    longer = build(tmp_path, "trainer.total_frames=256")
+    longer.train()
+    assert sorted(p.name for p in (tmp_path / "synthesis").iterdir()) == ["128", "256"]
+    changed = build(tmp_path, "trainer.total_frames=256", "synthesis.margin=0.2")
+    with pytest.raises(ConfigError, match="another one"):
+        changed.train()
+
+
+@pytest.mark.parametrize("never", ["safe", "unsafe"])
+def test_a_set_that_is_never_seen(never, tmp_path, capsys):
+    sets = {"safe": lambda state, info: state[0] < 3, "unsafe": lambda state, info: state[0] > 10}
+    sets[never] = lambda state, info: False
+
+    def env(batch_size, seed):
+        return GymnasiumPixels(Lane, batch_size=batch_size, seed=seed, image_size=16, reset_options={"below": 13}, **sets)
+
+    words = [*SMALL, f"buffer.{never}=0", "trainer.total_frames=128", f"out_dir={tmp_path}"]
+    experiment = Experiment(experiment_config(words, **{"logger.kind": "none"}), env)
+    experiment.train()
+    shown = "".join(capsys.readouterr())
+    assert ("no synthesis on latents: 0 of 128 transitions start in U" in shown) == (never == "unsafe")
+    assert (experiment.synthesis_dir is None) == (never == "unsafe")
+
+
+def test_of_many_transitions_those_of_the_sets_come_first(tmp_path):
+    experiment = build(tmp_path, "trainer.total_frames=256")
+    experiment.train()
+    region = experiment.store.region
+    few = experiment._transitions(100)
+    assert len(few) == len(set(few.tolist())) == 100
+    labelled = int((region != UNLABELLED).sum())
+    assert int((region[few] != UNLABELLED).sum()) >= min(50, labelled) > 10
+    assert experiment._transitions(1000).tolist() == list(range(256))
 
 
 def test_a_finished_experiment_is_not_trained_again_and_another_one_is_refused(tmp_path):

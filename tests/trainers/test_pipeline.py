@@ -13,7 +13,8 @@ from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.trainers.config import make_config
 from torchrl_sspl.trainers.evaluation import evaluate
-from torchrl_sspl.trainers.pipeline import CHECKPOINT_FILE, Check, SafePolicyTraining
+from torchrl_sspl.trainers.latents import CHECKPOINT_FILE
+from torchrl_sspl.trainers.pipeline import Check, SafePolicyTraining
 
 
 def make_env(batch_size: list[int], seed: int) -> PendulumEnv:

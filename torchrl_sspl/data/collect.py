@@ -192,6 +192,7 @@ def make_collector(
     frames_per_batch: int,
     total_frames: int,
     init_random_frames: int = 0,
+    max_frames_per_traj: int | None = None,
     policy_device: torch.device | str = "cpu",
     ray_address: str = "",
     seed: int | None = None,
@@ -210,6 +211,7 @@ def make_collector(
         frames_per_batch: transitions per batch, over all workers.
         total_frames: transitions to collect in all.
         init_random_frames: transitions under random actions at the beginning.
+        max_frames_per_traj: steps after which an episode is cut; ``None`` leaves that to the environment.
         policy_device: device of the policy; other processes always use the CPU.
         ray_address: address of a running cluster; ``""`` starts Ray on this machine.
         seed: seed of the environments; workers get different ones.
@@ -242,6 +244,7 @@ def make_collector(
         "frames_per_batch": frames_per_batch,
         "total_frames": total_frames,
         "init_random_frames": init_random_frames,
+        "max_frames_per_traj": max_frames_per_traj,
         "reset_at_each_iter": True,
         "trust_policy": True,
     }

@@ -95,6 +95,11 @@ class TransitionStore(Storage):
         columns = sum(c.numel() * c.element_size() for c in self._columns.values())
         return self._bank.memory_bytes + columns
 
+    @property
+    def region(self) -> Tensor:
+        """Region codes ``(n,)`` of the observations in which the transitions start."""
+        return self._columns.get("region", torch.zeros(0, 1, dtype=torch.int64))[: self._len, 0]
+
     def indices(self, region: int | None = None) -> Tensor:
         """Positions of the transitions that start in a region (a code of ``sets``), or of all.
 
@@ -102,11 +107,7 @@ class TransitionStore(Storage):
             EmptyRegionError: there is none.
         """
         if region not in self._by_region:
-            if region is None:
-                found = torch.arange(self._len)
-            else:
-                held = self._columns.get("region", torch.zeros(0, 1, dtype=torch.int64))[: self._len, 0]
-                found = (held == region).nonzero().squeeze(1)
+            found = torch.arange(self._len) if region is None else (self.region == region).nonzero().squeeze(1)
             self._by_region[region] = found
         found = self._by_region[region]
         if not found.numel():

@@ -52,7 +52,11 @@ class GymnasiumPixels(EnvBase):
         image_size: height and width of the frames, in pixels; pictures are averaged down to it.
         horizon: steps after which an episode is truncated; ``None`` leaves that to gymnasium.
         reset_options: ``options`` of gymnasium's reset, or ``(numpy generator) -> options``.
+        action_repeat: steps of gymnasium per step, all with the same action; the two frames of an observation, and what the
+            predicates judge, lie that far apart. Where a step moves less than the picture shows, it makes motion visible.
         settle: let one step pass after a reset.
+        ignore_termination: let episodes go on where gymnasium ends them, up to ``horizon``: where it ends them in U, no
+            transition would start there. The system has to bear it (those of gymnasium do, with a warning).
         device: device of the tensors.
         seed: seed of the resets.
 
@@ -85,7 +89,9 @@ class GymnasiumPixels(EnvBase):
         image_size: int = 64,
         horizon: int | None = None,
         reset_options: Mapping[str, Any] | Callable[[np.random.Generator], Mapping[str, Any]] | None = None,
+        action_repeat: int = 1,
         settle: bool = True,
+        ignore_termination: bool = False,
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
@@ -94,12 +100,17 @@ class GymnasiumPixels(EnvBase):
             raise ConfigError(f"batch_size: expected [n] with n >= 1, received {list(size)}.")
         if horizon is not None and horizon < 1:
             raise ConfigError(f"horizon: expected an integer >= 1 or None, received {horizon!r}.")
+        if not isinstance(action_repeat, int) or action_repeat < 1:
+            raise ConfigError(f"action_repeat: expected an integer >= 1, received {action_repeat!r}.")
+        if ignore_termination and horizon is None:
+            raise ConfigError("horizon: expected an integer >= 1 with ignore_termination, received None.")
         if not isinstance(image_size, int) or image_size < 8:
             raise ConfigError(f"image_size: expected an integer >= 8, received {image_size!r}.")
         super().__init__(device=torch.device(device or "cpu"), batch_size=size)
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.image_size, self.horizon = image_size, horizon
-        self.reset_options, self.settle = reset_options, settle
+        self.reset_options, self.settle, self.ignore_termination = reset_options, settle, ignore_termination
+        self.action_repeat = action_repeat
         self._safe, self._unsafe = safe, unsafe
         self._envs = [make() for _ in range(size[0])]
         first = self._envs[0]
@@ -189,6 +200,17 @@ class GymnasiumPixels(EnvBase):
             )
         return SAFE if safe else UNSAFE if unsafe else UNLABELLED
 
+    def _advance(self, env: Any, action: np.ndarray) -> tuple[Any, float, bool, bool, Mapping[str, Any]]:
+        """``action_repeat`` steps of gymnasium with the same action; rewards add up, the end of an episode ends them too."""
+        native, total = self._native_action(action), 0.0
+        for _ in range(self.action_repeat):
+            observation, reward, terminated, truncated, info = env.step(native)
+            total += float(reward)
+            terminated = bool(terminated) and not self.ignore_termination
+            if terminated or truncated:
+                break
+        return observation, total, terminated, bool(truncated), info
+
     def _restart(self, index: int) -> Tensor:
         """Reset one environment and, to settle it, let one step pass; returns the frame of the reset."""
         env = self._envs[index]
@@ -199,7 +221,7 @@ class GymnasiumPixels(EnvBase):
             before = self._draw(index)
             if not self.settle:
                 break
-            observation, _, terminated, truncated, info = env.step(self._native_action(np.zeros(self.action_dim)))
+            observation, _, terminated, truncated, info = self._advance(env, np.zeros(self.action_dim))
             if not (terminated or truncated):
                 break
         else:
@@ -237,17 +259,17 @@ class GymnasiumPixels(EnvBase):
         previous, self._frame = self._frame, torch.empty_like(self._frame)
         rewards, ended, cut = [], [], []
         for k, env in enumerate(self._envs):
-            observation, reward, terminated, truncated, info = env.step(self._native_action(actions[k]))
+            observation, reward, terminated, truncated, info = self._advance(env, actions[k])
             self._frame[k] = self._draw(k)
             self._steps[k] += 1
             self._last[k] = self._row(observation, info)
-            rewards.append(float(reward))
-            ended.append(bool(terminated))
-            cut.append(bool(truncated) or (self.horizon is not None and self._steps[k] >= self.horizon))
+            rewards.append(reward)
+            ended.append(terminated)
+            cut.append(truncated or (self.horizon is not None and self._steps[k] >= self.horizon))
         out = self._output(previous)
-        terminated, truncated = (torch.tensor(v, device=self.device)[:, None] for v in (ended, cut))
+        over, late = (torch.tensor(v, device=self.device)[:, None] for v in (ended, cut))
         out["reward"] = torch.tensor(rewards, device=self.device)[:, None]
-        out["terminated"], out["truncated"], out["done"] = terminated, truncated, terminated | truncated
+        out["terminated"], out["truncated"], out["done"] = over, late, over | late
         return out
 
     def _output(self, previous: Tensor) -> TensorDict:

@@ -29,10 +29,14 @@ PRESETS: MappingProxyType[str, MappingProxyType[str, Any]] = MappingProxyType(
         ),
         "sound": MappingProxyType(
             {
-                "safety_margin": 0.5,
+                "safety_margin": 0.3,
+                "safe_coeff": 0.3,
+                "unsafe_coeff": 0.3,
                 "consistency": "online",
                 "consistency_coeff": 2.0,
                 "inverse_dynamics_coeff": 1.0,
+                "variance_coeff": 0.5,
+                "covariance_coeff": 0.5,
                 "saturation_coeff": 0.3,
                 "mode": "R3",
                 "successor": "online",
@@ -63,8 +67,9 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
 
     * ``"paper"``: the equations as printed, every extra term off, sums over the batch. Needs a target-network
       updater.
-    * ``"sound"``: consistency through both branches kept from collapse by inverse dynamics and a wide hinge,
-      invariance as R3 with gradient to barrier and policy only, slow growth, hard mining.
+    * ``"sound"``: consistency through both branches kept from collapse by inverse dynamics and the spread of the
+      latents, a wide and light hinge, invariance as R3 with gradient to barrier and policy only, slow growth, hard
+      mining.
 
     Args:
         encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"`` and

@@ -14,6 +14,7 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 from torchrl_sspl.errors import ConfigError
 
 PRESETS = ("sound", "paper", "smoke")
+TEACHERS = ("clearance", "value")
 
 
 @dataclass

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import copy
 import json
+import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import nn
+from torch import Tensor, nn
 from torchrl.envs import EnvBase
 from torchrl.objectives import SoftUpdate
+from torchrl.trainers import LRSchedulerHook
 from tqdm import tqdm
 
 from torchrl_sspl.data import TransitionStore
@@ -25,9 +29,12 @@ from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.objectives import SSPLLoss
+from torchrl_sspl.sets import UNLABELLED, UNSAFE
+from torchrl_sspl.trainers.config import LatentConfig, SynthesisConfig, TrainingConfig
 from torchrl_sspl.trainers.episodes import evaluate_episodes, logged, random_actions, run_episodes, separating_level
 from torchrl_sspl.trainers.evaluation import Evaluation
 from torchrl_sspl.trainers.experiment_config import EnvFactory, ExperimentConfig, resolve
+from torchrl_sspl.trainers.latents import LatentTraining, encode_transitions
 from torchrl_sspl.trainers.loggers import close_logger, log_figure, log_scalars, log_video, make_logger
 from torchrl_sspl.trainers.torchrl_trainer import SSPLTrainer
 
@@ -180,6 +187,7 @@ class Experiment:
             config.logger.kind, config.logger.kind, self.directory, **_project(config.logger)
         )
         self.trainer = self._make_trainer()
+        self.synthesis_dir: Path | None = None  # log and checkpoint of what follows the joint training
         self.seconds = 0.0
 
     def _make_networks(self, encoder: Callable[[int], nn.Module] | None) -> None:
@@ -231,16 +239,17 @@ class Experiment:
             frames_per_batch=c.frames_per_batch,
             total_frames=t.total_frames,
             init_random_frames=c.init_random_frames,
+            max_frames_per_traj=c.max_frames_per_traj,
             policy_device=self.device,
             ray_address=c.ray_address,
             seed=config.seed,
         )
         # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
-        store = TransitionStore(config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"))
-        buffer = store.replay_buffer(config.buffer.batch, safe=config.buffer.safe, unsafe=config.buffer.unsafe)
+        self.store = TransitionStore(config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"))
+        buffer = self.store.replay_buffer(config.buffer.batch, safe=config.buffer.safe, unsafe=config.buffer.unsafe)
         delayed = any(name.startswith("target_") for name, _ in self.loss.named_children())
         optimizer = torch.optim.Adam(self.loss.parameters(), config.optim.lr, weight_decay=config.optim.weight_decay)
-        return SSPLTrainer(
+        trainer = SSPLTrainer(
             collector=collector,
             total_frames=t.total_frames,
             loss_module=self.loss,
@@ -261,6 +270,11 @@ class Experiment:
             log_interval=0,
             progress_bar=t.progress,
         )
+        if config.optim.schedule == "cosine":
+            steps = -(-t.total_frames // c.frames_per_batch) * t.optim_steps_per_batch
+            schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(_cosine, steps))
+            LRSchedulerHook(schedule, interval="optim").register(trainer)
+        return trainer
 
     def _evaluate_during(self, trainer: SSPLTrainer) -> dict[str, Any]:
         return logged(evaluate_episodes(self.agent(), self.make_env, self.config.evaluation))
@@ -276,8 +290,6 @@ class Experiment:
 
         Source: none.
         """
-        import copy
-
         parts = [copy.deepcopy(m).cpu() for m in (self.encoder, self.dynamics, self.barrier, self.policy)]
         barrier = parts[2].collapse()  # type: ignore[operator]
         with torch.no_grad():
@@ -309,15 +321,54 @@ class Experiment:
             except EmptyRegionError as error:
                 raise EmptyRegionError(
                     f"{error} Before the first optimiser step both sets have to be seen: raise "
-                    "collector.init_random_frames, start episodes there (reset_options of the environment), or lower "
-                    "buffer.safe or buffer.unsafe to 0."
+                    "collector.init_random_frames, start episodes there (reset_options of the environment), let them go on "
+                    "where gymnasium ends them (ignore_termination), or lower buffer.safe or buffer.unsafe to 0."
                 ) from error
         else:
             self.trainer.collector.shutdown()
+        self._synthesise(resume=resume and self.trainer.checkpoint_rotation is not None)
         agent = self.agent(self._level())
         agent.save(self.directory / "agent")
         self.seconds = time.monotonic() - began
         return agent
+
+    def _synthesise(self, *, resume: bool) -> None:
+        """Dynamics, policy and barrier once more, on latents that stand still: what moves under them no longer does."""
+        config, s = self.config, self.config.synthesis
+        if not s.enabled or config.loss.preset == "paper":
+            return
+        index = self._transitions(s.transitions)
+        latents = encode_transitions(self.loss, self.store, index)
+        unsafe = int((latents["region"] == UNSAFE).sum())
+        if unsafe in (0, len(index)):
+            tqdm.write(f"no synthesis on latents: {unsafe} of {len(index)} transitions start in U")
+            return
+        # Other data is another training, that begins anew.
+        self.synthesis_dir = self.directory / "synthesis" / str(self.trainer.collected_frames)
+        settings = TrainingConfig(
+            seed=config.seed,
+            out_dir=str(self.synthesis_dir),
+            progress=config.trainer.progress,
+            network=config.network,
+            synthesis=SynthesisConfig(**{f.name: getattr(s, f.name) for f in fields(LatentConfig)}),
+        )
+        networks = {name: copy.deepcopy(getattr(self, name)).cpu() for name in ("dynamics", "barrier", "policy")}
+        scale = ((self._high - self._low) / 2).tolist()
+        training = LatentTraining(settings, networks, action_scale=scale, latents=latents, resume=resume)
+        training.train_phases()
+        for name, network in networks.items():
+            getattr(self, name).load_state_dict(network.state_dict())
+
+    def _transitions(self, most: int) -> Tensor:
+        """Which transitions are encoded: of more than ``most``, those of S and U first, up to half, the rest at random."""
+        n = len(self.store)
+        if n <= most:
+            return torch.arange(n)
+        generator = torch.Generator().manual_seed(self.config.seed)
+        mixed = torch.randperm(n, generator=generator)
+        first = mixed[self.store.region[mixed] != UNLABELLED][: most // 2]
+        rest = mixed[~torch.isin(mixed, first)][: most - len(first)]
+        return torch.cat([first, rest])
 
     def _level(self) -> float:
         e = self.config.evaluation
@@ -395,6 +446,12 @@ def run_experiment(
     from torchrl_sspl.trainers.experiment_config import experiment_config
 
     return Experiment(experiment_config(overrides, **defaults), make_env, encoder=encoder, title=title).run()
+
+
+def _cosine(steps: int, step: int) -> float:
+    """Share of the learning rate in a step: up over a tenth of them, down to zero over the rest."""
+    done = min(1.0, step / steps)
+    return max(done / 0.1, 0.04) if done < 0.1 else 0.5 * (1 + math.cos(math.pi * (done - 0.1) / 0.9))
 
 
 def _project(logger: Any) -> dict[str, str]:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.trainers.config import NetworkConfig, _assign
+from torchrl_sspl.trainers.config import TEACHERS, LatentConfig, NetworkConfig, _assign
 
+SCHEDULES = ("cosine", "constant")
 BACKENDS = ("sync", "process", "ray")
 AUTOCAST = ("none", "bfloat16", "float16")
 
@@ -62,6 +63,8 @@ class GymnasiumEnvConfig:
         unsafe: "package.module:function" of (observation, info), true in U.
         image_size: height and width of the frames, in pixels.
         horizon: steps after which an episode is truncated.
+        action_repeat: steps of gymnasium per step, all with the same action.
+        ignore_termination: let episodes go on where gymnasium ends them, up to the horizon.
     """
 
     _target_: str = "torchrl_sspl.trainers.experiment_config.gymnasium_env"
@@ -70,6 +73,8 @@ class GymnasiumEnvConfig:
     unsafe: str = ""
     image_size: int = 64
     horizon: int | None = 50
+    action_repeat: int = 1
+    ignore_termination: bool = False
 
 
 @dataclass
@@ -97,9 +102,14 @@ class LossConfig:
     Attributes:
         preset: "sound" or "paper" (the losses as printed).
         safety_margin: margin of the hinges on S and U.
+        safe_coeff: weight of the hinge on S.
+        unsafe_coeff: weight of the hinge on U.
         dynamics_margin: margin of the invariance condition.
         consistency_coeff: weight of the latent consistency.
         inverse_dynamics_coeff: weight of reading the action from two latents.
+        variance_coeff: weight of the standard deviation that every latent dimension should reach.
+        covariance_coeff: weight against latent dimensions that tell the same.
+        saturation_coeff: weight of the penalty on latents that stick to their walls.
         synthesis_coeff: weight of the invariance condition.
         growth_coeff: weight of growth where the successor is inside.
         descent_coeff: weight of the policy's descent on the barrier.
@@ -109,9 +119,14 @@ class LossConfig:
 
     preset: str = "sound"
     safety_margin: float | None = None
+    safe_coeff: float | None = None
+    unsafe_coeff: float | None = None
     dynamics_margin: float | None = None
     consistency_coeff: float | None = None
     inverse_dynamics_coeff: float | None = None
+    variance_coeff: float | None = None
+    covariance_coeff: float | None = None
+    saturation_coeff: float | None = None
     synthesis_coeff: float | None = None
     growth_coeff: float | None = None
     descent_coeff: float | None = None
@@ -129,6 +144,7 @@ class CollectorConfig:
         envs: environments per collector, stepped together.
         frames_per_batch: transitions per batch, over all collectors.
         init_random_frames: transitions under random actions before learning starts.
+        max_frames_per_traj: steps after which an episode is cut, so that many start; "none" leaves that to the environment.
         exploration: standard deviation of the noise on the policy's actions, as a share of the largest action.
         random_share: share of the environments that act at random all the time.
         ray_address: address of a running Ray cluster; "" starts a local one.
@@ -139,6 +155,7 @@ class CollectorConfig:
     envs: int = 16
     frames_per_batch: int = 640
     init_random_frames: int = 1280
+    max_frames_per_traj: int | None = 10
     exploration: float = 0.1
     random_share: float = 0.5
     ray_address: str = ""
@@ -166,14 +183,38 @@ class OptimConfig:
     """The optimiser (Adam).
 
     Attributes:
-        lr: learning rate.
+        lr: learning rate, the largest one where it changes.
+        schedule: "cosine" (rises over the first tenth of the steps, falls to zero until the last) or "constant".
         weight_decay: weight decay.
         target_tau: step of the delayed networks, where the loss has any.
     """
 
     lr: float = 1e-3
+    schedule: str = "cosine"
     weight_decay: float = 0.0
     target_tau: float = 0.01
+
+
+@dataclass
+class ExperimentSynthesisConfig(LatentConfig):
+    """What follows the joint training: dynamics, policy and barrier once more, on latents of the collected transitions
+    that stand still; see ``LatentConfig`` for the inherited settings.
+
+    Attributes:
+        enabled: whether it does; never with loss.preset=paper, which trains as printed.
+        transitions: transitions that are encoded: all that start in S or U, at most half of them, and others at random.
+    """
+
+    enabled: bool = True
+    transitions: int = 40_000
+    teacher: str = "value"
+    actions: int = 7
+    dynamics_steps: int = 1500
+    teach_steps: int = 1500
+    fit_steps: int = 1500
+    steer_steps: int = 300
+    tune_steps: int = 1500
+    batch: int = 512
 
 
 @dataclass
@@ -284,6 +325,7 @@ class ExperimentConfig:
         buffer: store of transitions.
         optim: optimiser.
         trainer: training loop; group "trainer".
+        synthesis: training on latents that stand still, after the loop.
         logger: logger; group "logger".
         evaluation: evaluation on fresh episodes.
         seed: seed of data, initial weights and batches.
@@ -300,6 +342,7 @@ class ExperimentConfig:
     buffer: BufferConfig = field(default_factory=BufferConfig)
     optim: OptimConfig = field(default_factory=OptimConfig)
     trainer: Any = field(default_factory=TrainerConfig)
+    synthesis: ExperimentSynthesisConfig = field(default_factory=ExperimentSynthesisConfig)
     logger: Any = field(default_factory=CSVConfig)
     evaluation: EpisodesConfig = field(default_factory=EpisodesConfig)
     seed: int = 0
@@ -335,6 +378,14 @@ class ExperimentConfig:
         if isinstance(self.trainer, TrainerConfig) and self.trainer.autocast not in AUTOCAST:
             raise ConfigError(
                 f"expected trainer.autocast to be one of {', '.join(AUTOCAST)}, received '{self.trainer.autocast}'"
+            )
+        if self.optim.schedule not in SCHEDULES:
+            raise ConfigError(
+                f"expected optim.schedule to be one of {', '.join(SCHEDULES)}, received '{self.optim.schedule}'"
+            )
+        if self.synthesis.teacher not in TEACHERS:
+            raise ConfigError(
+                f"expected synthesis.teacher to be one of {', '.join(TEACHERS)}, received '{self.synthesis.teacher}'"
             )
         if self.loss.preset not in ("sound", "paper"):
             raise ConfigError(f"expected loss.preset to be sound or paper, received '{self.loss.preset}'")

@@ -31,6 +31,7 @@ def draw(experiment: Experiment, outcome: ExperimentOutcome) -> dict[str, Any]:
 
     Source: none.
     """
+    from torchrl_sspl.viz.curves import training_curves
     from torchrl_sspl.viz.figures import latent_space
     from torchrl_sspl.viz.plane import new_figure
 
@@ -60,6 +61,8 @@ def draw(experiment: Experiment, outcome: ExperimentOutcome) -> dict[str, Any]:
         axes.set(xlabel="batch", ylabel="loss", yscale="log")
         axes.legend(fontsize=7, ncols=2, frameon=False)
         figures["Training"] = figure
+    if experiment.synthesis_dir is not None:
+        figures["Training on latents"] = training_curves(experiment.synthesis_dir / "log.jsonl")
     return figures
 
 

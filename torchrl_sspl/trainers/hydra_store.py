@@ -151,7 +151,7 @@ def _check_rounds(config: ExperimentConfig) -> None:
     """The rounds have networks, data and evaluation of their own; what they would ignore is refused."""
     rounds: TrainingConfig = config.trainer
     plain = ExperimentConfig()
-    for name in ("network", "loss", "collector", "buffer", "optim", "evaluation"):
+    for name in ("network", "loss", "collector", "buffer", "optim", "synthesis", "evaluation"):
         if getattr(config, name) != getattr(plain, name):
             inside = f"trainer.{name}" if hasattr(rounds, name) else "trainer.representation and trainer.synthesis"
             raise ConfigError(
@@ -245,8 +245,10 @@ def attribute_texts(kind: type) -> dict[str, str]:
         >>> attribute_texts(LossConfig)["safety_margin"]
         'margin of the hinges on S and U.'
     """
-    _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
     texts: dict[str, str] = {}
+    for parent in kind.__bases__:
+        texts |= attribute_texts(parent)
+    _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
     name = ""
     for line in section.splitlines():
         if match := re.match(r" {4}(\w+): (.*)", line):

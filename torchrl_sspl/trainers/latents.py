@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import json
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,8 +17,9 @@ from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
+from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.errors import CheckpointError, ConfigError
-from torchrl_sspl.objectives import ActionValueLoss, SynthesisLoss, TargetLoss
+from torchrl_sspl.objectives import ActionValueLoss, SSPLLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.latent_viability import (
     barrier_targets,
     nearby_residuals,
@@ -30,13 +32,14 @@ from torchrl_sspl.objectives.latent_viability import (
     value_targets,
 )
 from torchrl_sspl.sets import SAFE, UNSAFE
-from torchrl_sspl.trainers.config import TrainingConfig
+from torchrl_sspl.trainers.config import TEACHERS, TrainingConfig
 from torchrl_sspl.trainers.loggers import METRICS, log_scalars
 
 CHECKPOINT_FILE = "checkpoint.pt"
-TEACHERS = ("clearance", "value")
 _KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
+_ENCODE_CHUNK = 1000
+_MOST_ACTIONS = 729  # in the grid that is tried at every latent
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 
 
@@ -321,15 +324,13 @@ class LatentTraining:
             worst_fraction=0.02,
         )
 
+        # What the sets hold counts more than its share of the data; S may be empty.
+        shares = ((unsafe, s.batch // 2), (rim_of_unsafe, s.batch // 2), (safe, s.batch // 4))
+
         def step() -> TensorDict:
-            rows = torch.cat(
-                [
-                    self._pick(len(table), s.batch),
-                    unsafe[self._pick(len(unsafe), s.batch // 2)],
-                    rim_of_unsafe[self._pick(len(rim_of_unsafe), s.batch // 2)],
-                    safe[self._pick(len(safe), s.batch // 4)],
-                ]
-            )
+            drawn = [self._pick(len(table), s.batch)]
+            drawn += [rows[self._pick(len(rows), n)] for rows, n in shares if len(rows)]
+            rows = torch.cat(drawn)
             asked = rim[self._pick(len(rim), 3 * s.batch // 2)]
             error = asked["residual"][torch.arange(len(asked)), self._pick(s.residuals, len(asked))]
             asked = asked.exclude("residual").set("residual", error)
@@ -361,9 +362,9 @@ class LatentTraining:
         hard = TensorDict(latent=latent, residual=torch.zeros_like(latent), batch_size=[len(latent)])
         return torch.cat([asked, hard])
 
-    @torch.no_grad()
     # ------------------------------------------------------------------ targets
 
+    @torch.no_grad()
     def _tube(self, latent: Tensor, radius: float, salt: int) -> tuple[Tensor, Tensor]:
         """Latents moved off the data manifold along its normals, and the rows that they came from."""
         g = torch.Generator().manual_seed(self.config.seed + 77_000 + salt)
@@ -481,8 +482,16 @@ class LatentTraining:
         return nearby_residuals(latent, z[sample], residual[sample], count=self.config.synthesis.residuals, spread=spread)
 
     def _action_grid(self, per_dimension: int) -> Tensor:
-        axes = [torch.linspace(-scale, scale, per_dimension) for scale in self.action_scale]
-        return torch.cartesian_prod(*axes).reshape(-1, len(axes))
+        """A regular grid of actions, coarser where many dimensions would make it too large."""
+        m = len(self.action_scale)
+        k = max(2, min(per_dimension, int(_MOST_ACTIONS ** (1 / m) + 1e-6)))
+        if k**m > 8 * _MOST_ACTIONS:
+            raise ConfigError(
+                f"expected at most {int(math.log2(8 * _MOST_ACTIONS))} action dimensions, received {m}: a grid of actions is "
+                "tried at every latent; set synthesis.enabled=false to keep what the joint training has found"
+            )
+        axes = [torch.linspace(-scale, scale, k) for scale in self.action_scale]
+        return torch.cartesian_prod(*axes).reshape(-1, m)
 
     @torch.no_grad()
     def _successors(self, latent: Tensor, actions: Tensor) -> Tensor:
@@ -564,6 +573,30 @@ class LatentTraining:
         self.phase, self.step, self.seconds = body["phase"], body["step"], body["seconds"]
         self._loop_state = body["loop"]
 
+
+
+@torch.no_grad()
+def encode_transitions(loss: SSPLLoss, store: TransitionStore, index: Tensor | None = None) -> dict[str, Tensor]:
+    """Latents of stored transitions, under the encoder of a loss.
+
+    Args:
+        loss: encodes; on any device.
+        store: transitions.
+        index: ``(n,)`` which of them; by default all.
+
+    Returns:
+        What :class:`LatentTraining` takes: ``"latent"``, ``"next_latent"``, ``"action"`` and ``"region"``, on the CPU.
+
+    Source: none.
+    """
+    device = next(loss.parameters()).device
+    parts = []
+    for rows in (torch.arange(len(store)) if index is None else index).split(_ENCODE_CHUNK):
+        batch = store.get(rows)
+        latent, after = loss.latents(batch.to(device))
+        parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"]))
+    names = ("latent", "next_latent", "action", "region")
+    return {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
 
 
 def _finite(value: float) -> bool:
