@@ -9,8 +9,10 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parent.parent
-PACKAGE = ROOT / "torchrl_sspl"
+import torchrl_sspl
+
+PACKAGE = Path(torchrl_sspl.__file__).parent  # the checkout's, or that of an installed wheel
+ROOT = PACKAGE.parent
 FLOORS = {
     "errors": 0, "sets": 0, "functional": 0,
     "lipschitz": 1,

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -122,6 +122,7 @@ class ExperimentOutcome:
         evaluation: measurements on fresh episodes.
         seconds: wall-clock time of the training.
         report: the page, or None where matplotlib is missing.
+        warnings: what went wrong, and what to do about it.
     """
 
     directory: Path
@@ -129,6 +130,7 @@ class ExperimentOutcome:
     evaluation: Evaluation
     seconds: float
     report: Path | None
+    warnings: list[str] = field(default_factory=list)
 
     def summary(self) -> str:
         """The main measurements as text."""
@@ -141,7 +143,7 @@ class ExperimentOutcome:
         proof = self.agent.description["lipschitz"]
         proved = "proved" if proof["proved"] else f"not proved ({proof['reason']})"
         lines.append(f"the barrier is {self.agent.lipschitz_bound:g}-Lipschitz: {proved}")
-        return "\n".join([*lines, f"training: {self.seconds:.0f} s"])
+        return "\n".join([*lines, f"training: {self.seconds:.0f} s", *(f"warning: {text}" for text in self.warnings)])
 
 
 class Experiment:
@@ -187,6 +189,7 @@ class Experiment:
             config.logger.kind, config.logger.kind, self.directory, **_project(config.logger)
         )
         self.trainer = self._make_trainer()
+        self.warnings: list[str] = []
         self.synthesis_dir: Path | None = None  # log and checkpoint of what follows the joint training
         self.seconds = 0.0
 
@@ -335,13 +338,17 @@ class Experiment:
     def _synthesise(self, *, resume: bool) -> None:
         """Dynamics, policy and barrier once more, on latents that stand still: what moves under them no longer does."""
         config, s = self.config, self.config.synthesis
+        self.warnings = []
         if not s.enabled or config.loss.preset == "paper":
             return
         index = self._transitions(s.transitions)
         latents = encode_transitions(self.loss, self.store, index)
         unsafe = int((latents["region"] == UNSAFE).sum())
         if unsafe in (0, len(index)):
-            tqdm.write(f"no synthesis on latents: {unsafe} of {len(index)} transitions start in U")
+            self.warnings.append(
+                f"policy and barrier are those of the joint training: {unsafe} of {len(index)} transitions start in U, and "
+                "what follows needs both kinds"
+            )
             return
         # Other data is another training, that begins anew.
         self.synthesis_dir = self.directory / "synthesis" / str(self.trainer.collected_frames)
@@ -356,6 +363,12 @@ class Experiment:
         scale = ((self._high - self._low) / 2).tolist()
         training = LatentTraining(settings, networks, action_scale=scale, latents=latents, resume=resume)
         training.train_phases()
+        if training.kept_share == 0.0:
+            self.warnings.append(
+                "no safe set was found: the errors of the latent dynamics are larger than what the actions can correct. "
+                "What the policy needs may not show in two pictures (action_repeat, image_size, network.pool_to), the latent "
+                "may be too small (network.latent_dim), or more data is needed (trainer.total_frames)"
+            )
         for name, network in networks.items():
             getattr(self, name).load_state_dict(network.state_dict())
 
@@ -400,7 +413,7 @@ class Experiment:
         (self.directory / "config.json").write_text(json.dumps(self.config.to_dict(), indent=1) + "\n")
         agent = self.train(resume=resume)
         evaluation = evaluate_episodes(agent, self.make_env, self.config.evaluation)
-        outcome = ExperimentOutcome(self.directory, agent, evaluation, self.seconds, None)
+        outcome = ExperimentOutcome(self.directory, agent, evaluation, self.seconds, None, self.warnings)
         body = {"seed": self.config.seed, "training_seconds": self.seconds, "measurements": evaluation.to_dict(),
                 "lipschitz": {k: v for k, v in agent.description["lipschitz"].items() if k != "multipliers"},
                 "config": self.config.to_dict()}  # fmt: skip

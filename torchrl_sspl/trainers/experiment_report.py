@@ -89,6 +89,7 @@ def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str,
     proof = outcome.agent.description["lipschitz"]
     bound = f"The deployed float32 barrier is {outcome.agent.lipschitz_bound:g}-Lipschitz on all of its domain"
     notes = [
+        *(f"Warning: {text}." for text in outcome.warnings),
         f"Training took {outcome.seconds:.0f} s.",
         "No model of the environment is known: every figure counts fresh episodes from its own resets. Nothing is said "
         "about states that these do not reach.",

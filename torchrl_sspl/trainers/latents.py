@@ -95,6 +95,7 @@ class LatentTraining:
         self._loop_state: dict[str, Any] | None = None
         self._target_round: int | None = None
         self.taught: nn.Module | None = None
+        self.kept_share: float | None = None  # of the latents outside U, what can be kept under the observed errors
         self._target_table: TensorDict
         self._rim: TensorDict
         self._last_checkpoint = time.monotonic()
@@ -447,7 +448,8 @@ class LatentTraining:
         best[outer] = torch.softmax(-times / 0.1, 1) @ actions
         weight = torch.ones(len(z))
         weight[outer] = (times.min(1).values < 100).float()
-        self._log({"step": 0, "inside_of_allowed": float(found.inside.float().mean()), "sweeps": found.iterations})
+        self.kept_share = float(found.inside.float().mean())
+        self._log({"step": 0, "inside_of_allowed": self.kept_share, "sweeps": found.iterations})
         return target, member, best, weight
 
     @torch.no_grad()
@@ -469,7 +471,8 @@ class LatentTraining:
             tube_radius=s.tube_radius,
             lipschitz_bound=self.config.network.lipschitz_bound,
         )
-        self._log({"step": 0, "inside_of_allowed": float((value[~unsafe] > 0).float().mean())})
+        self.kept_share = float((value[~unsafe] > 0).float().mean())
+        self._log({"step": 0, "inside_of_allowed": self.kept_share})
         return target, target <= 0, action, torch.ones(len(z))
 
     def _errors(self, latent: Tensor, generator: torch.Generator, spread: float) -> tuple[Tensor, Tensor]:
@@ -527,6 +530,7 @@ class LatentTraining:
             "latents": self.latents,
             "counterexamples": self.counterexamples,
             "taught": None if self.taught is None else self.taught.state_dict(),
+            "kept_share": self.kept_share,
             **self._more_state(),
             "generator": self.generator.get_state(),
             "loop": self._loop_state,
@@ -563,7 +567,7 @@ class LatentTraining:
                 "delete the folder to start again"
             )
         self.networks.load_state_dict(body["networks"])
-        self.latents = body["latents"]
+        self.latents, self.kept_share = body["latents"], body["kept_share"]
         self.counterexamples = body["counterexamples"]
         if body["taught"] is not None:
             self.taught = copy.deepcopy(self.policy).requires_grad_(False)
