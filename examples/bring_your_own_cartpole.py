@@ -7,16 +7,31 @@ import sys
 from functools import partial
 
 import gymnasium
+import numpy as np
 
 from torchrl_sspl.envs import GymnasiumPixels
 from torchrl_sspl.trainers.experiment import run_experiment
 
+
+class OnTheCart(gymnasium.Wrapper):  # the camera rides on the cart: pole and rate fill the picture
+    def render(self):
+        left = round(220 + 125 * self.unwrapped.state[0])  # 125 pixels a metre
+        return np.roll(self.env.render(), -left, axis=1)[160:320, :160]
+
+
+def make():
+    cart = gymnasium.make("CartPole-v1", render_mode="rgb_array")
+    cart.unwrapped.kinematics_integrator = "semi-implicit"  # a push shows in the next picture, not in the one after it
+    return OnTheCart(cart)
+
+
 my_env = partial(
     GymnasiumPixels,
-    lambda: gymnasium.make("CartPole-v1", render_mode="rgb_array"),
+    make,
     safe=lambda state, info: abs(state[2]) < 0.03 and abs(state[3]) < 0.3,  # pole angle in rad, rate in rad/s
     unsafe=lambda state, info: abs(state[2]) > 0.15,
     reset_options={"low": -0.12, "high": 0.12},
+    action_repeat=2,  # 0.04 s between two pictures
     image_size=64,
     horizon=40,
 )

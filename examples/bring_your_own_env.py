@@ -49,7 +49,5 @@ my_env = partial(
 )
 
 if __name__ == "__main__":
-    size = {"trainer.total_frames": 9600, "trainer.optim_steps_per_batch": 320, "trainer.warm_start_steps": 1500}
-    names = {"title": "Pusher on a table", "out_dir": "runs/push"}
-    outcome = run_experiment(my_env, sys.argv[1:], encoder=Encoder, **names, **size, **{"optim.lr": 2e-3})
+    outcome = run_experiment(my_env, sys.argv[1:], encoder=Encoder, title="Pusher on a table", out_dir="runs/push")
     print(outcome.summary(), f"\nreport: {outcome.report}")

@@ -9,11 +9,12 @@ from functools import partial
 from pathlib import Path
 
 import pytest
-from tiny import TINY_SYNTHESIS
+from tiny import TINY_EXPERIMENT
 
 from torchrl_sspl.errors import EmptyRegionError
 from torchrl_sspl.modules import agent as registry
 from torchrl_sspl.modules.agent import load
+from torchrl_sspl.trainers.certify import verify_run
 from torchrl_sspl.trainers.episodes import evaluate_episodes
 from torchrl_sspl.trainers.experiment import run_experiment
 from torchrl_sspl.trainers.experiment_config import EpisodesConfig
@@ -26,7 +27,7 @@ TINY = [
     "trainer.checkpoint_every=-1", "collector.frames_per_batch=80", "collector.envs=4", "collector.init_random_frames=80",
     "network.barrier_hidden=[8]", "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "buffer.batch=16",
     "evaluation.episodes=6", "evaluation.envs=3", "evaluation.horizon=6",
-    *TINY_SYNTHESIS,
+    *TINY_EXPERIMENT,
 ]  # fmt: skip
 
 
@@ -57,7 +58,8 @@ def test_from_the_simulator_to_the_report(name, tmp_path, monkeypatch):
     page = outcome.report.read_text()
     assert "Tiny" in page
     assert "data:image/gif" in page
-    assert "exact integer arithmetic" in page
+    assert "What the weights prove" in page
+    assert "What fresh episodes show" in page
     assert "episodes from B &lt;= 0 that touch U" in page or "touch_unsafe" in page
     for name in ("csv/scalars/loss_unsafe.csv", "csv/scalars/eval_touch_unsafe.csv", "csv/videos"):
         assert (tmp_path / name).exists()
@@ -65,6 +67,8 @@ def test_from_the_simulator_to_the_report(name, tmp_path, monkeypatch):
         monkeypatch.setitem(registry.ENCODERS, "Encoder", encoder)
     again = evaluate_episodes(load(tmp_path), module.my_env, EpisodesConfig(episodes=6, envs=3, horizon=6))
     assert again["starts_inside"] == outcome.evaluation["starts_inside"]
+    assert verify_run(tmp_path) == 0
+    assert set(outcome.certificate.layers) == {"deterministic", "statistical", "paper"}
 
 
 def test_the_program_of_the_page_is_one():

@@ -8,7 +8,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tiny import TINY as SMOKE
-from tiny import TINY_SYNTHESIS
+from tiny import TINY_EXPERIMENT
 
 from torchrl_sspl.data import TransitionStore, collect_random
 from torchrl_sspl.envs import PendulumEnv
@@ -30,7 +30,7 @@ TINY = [
     "trainer.total_frames=512", "trainer.optim_steps_per_batch=4", "trainer.warm_start_steps=4", "trainer.progress=false",
     "trainer.checkpoint_every=-1", "collector.frames_per_batch=256", "collector.envs=64", "collector.init_random_frames=256",
     "buffer.batch=64", "env.image_size=32", "evaluation.episodes=8", "evaluation.envs=8", "evaluation.horizon=4",
-    *TINY_SYNTHESIS,
+    *TINY_EXPERIMENT,
 ]  # fmt: skip
 
 

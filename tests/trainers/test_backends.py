@@ -96,6 +96,7 @@ RUN = [
     "trainer.checkpoint_every=-1", "collector.frames_per_batch=640", "collector.envs=16", "collector.init_random_frames=640",
     "env.image_size=16", "network.pool_to=16", "network.latent_dim=2", "buffer.batch=96", "optim.lr=3e-3", "logger=none",
     "evaluation.episodes=200", "evaluation.envs=100", "evaluation.horizon=8", "evaluation.calibrate=false",
+    "evaluation.certificate_episodes=0", "evaluation.certificate_seconds=1",
     "synthesis.enabled=false",  # the joint training is compared
 ]  # fmt: skip
 

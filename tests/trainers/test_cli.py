@@ -8,7 +8,7 @@ import sys
 import types
 
 import pytest
-from tiny import TINY, TINY_SYNTHESIS
+from tiny import TINY, TINY_EXPERIMENT
 
 import torchrl_sspl
 from torchrl_sspl import cli
@@ -18,7 +18,7 @@ SMALL = [
     "trainer.checkpoint_every=-1", "collector.frames_per_batch=32", "collector.envs=16", "collector.init_random_frames=32",
     "env.image_size=16", "network.pool_to=8", "network.barrier_hidden=[8]", "network.policy_hidden=[8]",
     "network.dynamics_hidden=[8]", "buffer.batch=16", "evaluation.episodes=4", "evaluation.envs=4", "evaluation.horizon=3",
-    *TINY_SYNTHESIS,
+    *TINY_EXPERIMENT,
 ]  # fmt: skip
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 

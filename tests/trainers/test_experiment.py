@@ -8,7 +8,7 @@ import pytest
 import torch
 from gymnasium import spaces
 from tensordict import TensorDict
-from tiny import TINY_SYNTHESIS
+from tiny import TINY_EXPERIMENT
 from torch import nn
 
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
@@ -159,7 +159,7 @@ SMALL = [
     "collector.frames_per_batch=64", "collector.envs=8", "collector.init_random_frames=64", "network.pool_to=8",
     "network.barrier_hidden=[8]", "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "buffer.batch=16",
     "evaluation.episodes=4", "evaluation.envs=4", "evaluation.horizon=4",
-    *TINY_SYNTHESIS,
+    *TINY_EXPERIMENT,
 ]  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny import TINY_SYNTHESIS
+from tiny import TINY_EXPERIMENT
 
 from torchrl_sspl.trainers.experiment import Experiment
 from torchrl_sspl.trainers.experiment_config import experiment_config
@@ -15,7 +15,7 @@ TINY = [
     "trainer.checkpoint_every=-1", "collector.frames_per_batch=64", "collector.envs=32", "collector.init_random_frames=64",
     "buffer.batch=32", "env.image_size=16", "network.pool_to=16", "network.barrier_hidden=[8]", "network.dynamics_hidden=[8]",
     "network.policy_hidden=[8]",
-    *TINY_SYNTHESIS,
+    *TINY_EXPERIMENT,
 ]  # fmt: skip
 
 

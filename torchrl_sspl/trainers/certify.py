@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import torch
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import (
@@ -31,9 +32,12 @@ from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CertificationError, ConfigError
 from torchrl_sspl.functional import covering_radius
 from torchrl_sspl.modules.agent import Agent, agent_directory
+from torchrl_sspl.sets import SAFE, UNSAFE
+from torchrl_sspl.trainers.episodes import Episodes, random_actions, run_episodes
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
 
 CERTIFICATE_FILE = "certificate.json"
+_COVERED = 4000  # observations of which a covering radius is computed
 #: What a certificate is about; everything else in the description (the certificate's own traces, notes) may change.
 _CERTIFIED_KEYS = ("networks", "training", "lipschitz")
 
@@ -73,6 +77,62 @@ def certify(
         >>> certify(load("pendulum"), None, name="pendulum").layers["deterministic"].holds
         True
     """
+    certificate = _proved(agent, name, level, budget)
+    if env is not None:
+        sample, conditions = _measure(agent, env, certificate.level, episodes, horizon, seed, progress)
+        _add_measured(certificate, sample, conditions)
+    return certificate
+
+
+def certify_on_episodes(
+    agent: Agent,
+    make_env: Callable[..., EnvBase],
+    *,
+    name: str = "agent",
+    level: float | None = None,
+    episodes: int = 1000,
+    horizon: int = 50,
+    envs: int = 20,
+    seed: int = 20260708,
+    used_seeds: Sequence[int] = (),
+    budget: Budget | None = None,
+) -> Certificate:
+    r"""Certifies a frozen agent for an environment that is known only by being run.
+
+    What the weights prove is the same as with :func:`certify`. What is measured are episodes from the environment's own
+    resets: those that start in the set, and one observation of U, the lowest, of every episode that shows any.
+
+    Args:
+        agent: frozen agent.
+        make_env: ``(batch_size=[k], seed=...) -> environment`` with ``"pixels"`` and ``"region"``.
+        name: name of the agent.
+        level: s, barrier units; searched for if not given.
+        episodes: fresh episodes under the policy, and as many under random actions.
+        horizon: steps per episode.
+        envs: environments stepped together.
+        seed: seed of the fresh episodes; must not have been used for anything else.
+        used_seeds: seeds with which anything was trained, chosen or tuned.
+        budget: of each search of the deterministic layer.
+
+    Returns:
+        The certificate.
+
+    Source: paper Theorem 1; deviation: as for :func:`certify`.
+    """
+    certificate = _proved(agent, name, level, budget)
+    env = make_env(batch_size=[envs], seed=seed)
+    try:
+        own = run_episodes(agent, env, episodes, horizon)
+        chance = run_episodes(agent, env, episodes, horizon, random_actions(env, seed + 1))
+    finally:
+        env.close()
+    sample, conditions = _measure_episodes(agent, own, chance, certificate.level, seed, used_seeds)
+    _add_measured(certificate, sample, conditions)
+    return certificate
+
+
+def _proved(agent: Agent, name: str, level: float | None, budget: Budget | None) -> Certificate:
+    """A certificate with what the weights prove."""
     budget = budget or Budget(seconds=300.0)
     parts = (agent.barrier, agent.dynamics, agent.policy)
     bound, p = agent.lipschitz_bound, agent.latent_dim
@@ -88,15 +148,16 @@ def certify(
         budget=budget,
     )
     certified = {k: agent.description.get(k) for k in _CERTIFIED_KEYS} | {"lipschitz_bound": bound}
-    certificate = Certificate(
+    return Certificate(
         name, weights_digest(agent.state_dict()), configuration_digest(certified), level, {"deterministic": proof}
     )
-    if env is not None:
-        tolerated = next((s.value for s in proof.statements if s.name == "tolerated error"), None)
-        sample, conditions = _measure(agent, env, level, episodes, horizon, seed, progress)
-        certificate.layers["statistical"] = statistical_layer(sample, level=level, tolerated_error=tolerated)
-        certificate.layers["paper"] = conditions
-    return certificate
+
+
+def _add_measured(certificate: Certificate, sample: Sample, conditions: Layer) -> None:
+    proof = certificate.layers["deterministic"]
+    tolerated = next((s.value for s in proof.statements if s.name == "tolerated error"), None)
+    certificate.layers["statistical"] = statistical_layer(sample, level=certificate.level, tolerated_error=tolerated)
+    certificate.layers["paper"] = conditions
 
 
 @torch.no_grad()
@@ -133,17 +194,6 @@ def _measure(
         error, barrier = run.prediction_error, run.barrier
     else:
         error, barrier = torch.zeros(1, 0), torch.zeros(2, 0)
-    rims = []
-    before = barrier[:-1]
-    for name, lower, upper in (
-        ("deep in the set", -math.inf, level - 0.3),
-        ("half way", level - 0.3, level - 0.1),
-        ("at the rim", level - 0.1, level),
-    ):
-        here = error[(before > lower) & (before <= upper)].sort().values
-        if len(here):
-            rank = min(len(here) - 1, math.ceil(0.999 * len(here)) - 1)
-            rims.append((name, len(here), float(here[rank]), float(here[-1])))
     latent = torch.cat([inside, unsafe_latent, safe_latent])
     sample = Sample(
         error.amax(0) if error.shape[1] else torch.zeros(0),
@@ -154,15 +204,71 @@ def _measure(
         seed,
         used_seeds=used,
         fingerprints=fingerprint(torch.cat([start, unsafe_state, safe_state])),
-        rims=rims,
+        rims=_rims(error, barrier[:-1], level),
     )
     reference = encode_states(agent, env, env.sample_states(4 * episodes, generator=generator))
+    return sample, _conditions(agent, inside, safe, unsafe, latent, reference, error)
+
+
+@torch.no_grad()
+def _measure_episodes(
+    agent: Agent, own: Episodes, chance: Episodes, level: float, seed: int, used_seeds: Sequence[int]
+) -> tuple[Sample, Layer]:
+    """The same of episodes from an environment's own resets, of which some steps lie behind their end."""
+    start = own.barrier[0] <= level
+    alive, error = own.alive[:, start], own.prediction_error[:, start]
+    barrier = torch.where(alive, own.barrier[:, start], -math.inf)  # behind the end nothing counts
+    error = torch.where(alive[1:], error, 0.0)
+    both = {k: torch.cat([getattr(own, k), getattr(chance, k)], 1) for k in ("barrier", "region", "alive", "latent")}
+    shown = (both["region"] == UNSAFE) & both["alive"]
+    lowest = torch.where(shown, both["barrier"], math.inf).amin(0)
+    seen = own.latent[own.alive]
+    generator = torch.Generator().manual_seed(seed)
+
+    def some(rows: Tensor) -> Tensor:  # the covering radius compares all pairs
+        return rows[torch.randperm(len(rows), generator=generator)[:_COVERED]]
+
+    sample = Sample(
+        error.amax(0),
+        (barrier > level).any(0),
+        lowest[shown.any(0)],
+        both["latent"][both["alive"]],
+        len(error),
+        seed,
+        used_seeds=used_seeds,
+        rims=_rims(error, barrier[:-1], level),
+    )
+    safe = both["barrier"][(both["region"] == SAFE) & both["alive"]]
+    inside = seen[own.barrier[own.alive] <= level]
+    reference = some(chance.latent[chance.alive])
+    return sample, _conditions(agent, inside, safe, both["barrier"][shown], some(seen), reference, error)
+
+
+def _rims(error: Tensor, before: Tensor, level: float) -> list[tuple[str, int, float, float]]:
+    """Errors of steps, by where in the set they began."""
+    rims = []
+    for name, lower, upper in (
+        ("deep in the set", -math.inf, level - 0.3),
+        ("half way", level - 0.3, level - 0.1),
+        ("at the rim", level - 0.1, level),
+    ):
+        here = error[(before > lower) & (before <= upper)].sort().values
+        if len(here):
+            rank = min(len(here) - 1, math.ceil(0.999 * len(here)) - 1)
+            rims.append((name, len(here), float(here[rank]), float(here[-1])))
+    return rims
+
+
+def _conditions(
+    agent: Agent, inside: Tensor, safe: Tensor, unsafe: Tensor, latent: Tensor, reference: Tensor, error: Tensor
+) -> Layer:
+    """The paper's conditions on fresh observations."""
     following = agent.barrier(agent.dynamics(inside, agent.policy(inside)))[:, 0]
     try:
         constant = closed_loop_lipschitz(agent.dynamics, agent.policy)
     except ConfigError:
         constant = math.inf
-    conditions = paper_layer(
+    return paper_layer(
         safe=safe,
         unsafe=unsafe,
         following=following,
@@ -171,7 +277,6 @@ def _measure(
         dynamics_error=float(error.max()) if error.numel() else math.nan,
         closed_loop_constant=constant,
     )
-    return sample, conditions
 
 
 def verify_run(name: str | Path, *, env: SafetyEnv | None = None, report: Callable[[str], None] = print) -> int:

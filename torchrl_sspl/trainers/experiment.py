@@ -21,6 +21,8 @@ from torchrl.objectives import SoftUpdate
 from torchrl.trainers import LRSchedulerHook
 from tqdm import tqdm
 
+from torchrl_sspl.certification.branch_and_bound import Budget
+from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.data.collect import make_collector
 from torchrl_sspl.envs.base import SafetyEnv
@@ -30,6 +32,7 @@ from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, make_roll
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.objectives import SSPLLoss
 from torchrl_sspl.sets import UNLABELLED, UNSAFE
+from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, certify, certify_on_episodes
 from torchrl_sspl.trainers.config import LatentConfig, SynthesisConfig, TrainingConfig
 from torchrl_sspl.trainers.episodes import evaluate_episodes, logged, random_actions, run_episodes, separating_level
 from torchrl_sspl.trainers.evaluation import Evaluation
@@ -120,6 +123,7 @@ class ExperimentOutcome:
         directory: where everything lies.
         agent: the frozen agent.
         evaluation: measurements on fresh episodes.
+        certificate: what is proved and what was measured; also in ``agent/certificate.json``.
         seconds: wall-clock time of the training.
         report: the page, or None where matplotlib is missing.
         warnings: what went wrong, and what to do about it.
@@ -128,6 +132,7 @@ class ExperimentOutcome:
     directory: Path
     agent: Agent
     evaluation: Evaluation
+    certificate: Certificate
     seconds: float
     report: Path | None
     warnings: list[str] = field(default_factory=list)
@@ -140,9 +145,7 @@ class ExperimentOutcome:
             value = "not measured" if m.value is None else f"{m.value:.2%} ({m.events} of {m.n})"
             bounds = "" if m.lower is None or m.upper is None else f", 95 % bounds {m.lower:.2%} to {m.upper:.2%}"
             lines.append(f"{label:<52} {value}{bounds}")
-        proof = self.agent.description["lipschitz"]
-        proved = "proved" if proof["proved"] else f"not proved ({proof['reason']})"
-        lines.append(f"the barrier is {self.agent.lipschitz_bound:g}-Lipschitz: {proved}")
+        lines += [f"certificate, {layer.name} layer: {layer.verdict}" for layer in self.certificate.layers.values()]
         return "\n".join([*lines, f"training: {self.seconds:.0f} s", *(f"warning: {text}" for text in self.warnings)])
 
 
@@ -274,7 +277,8 @@ class Experiment:
             progress_bar=t.progress,
         )
         if config.optim.schedule == "cosine":
-            steps = -(-t.total_frames // c.frames_per_batch) * t.optim_steps_per_batch
+            batches, random = (math.ceil(n / c.frames_per_batch) for n in (t.total_frames, c.init_random_frames))
+            steps = max(1, batches - max(random, 1) + 1) * t.optim_steps_per_batch
             schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(_cosine, steps))
             LRSchedulerHook(schedule, interval="optim").register(trainer)
         return trainer
@@ -399,8 +403,28 @@ class Experiment:
             env.close()
         return separating_level(held_out, e.guard)
 
+    def _certificate(self, agent: Agent) -> Certificate:
+        e, name = self.config.evaluation, self.directory.name
+        budget = Budget(seconds=e.certificate_seconds)
+        if e.certificate_episodes:
+            certificate = certify_on_episodes(
+                agent,
+                self.make_env,
+                name=name,
+                episodes=e.certificate_episodes,
+                horizon=e.horizon,
+                envs=e.envs,
+                seed=e.seed + 2000,
+                used_seeds=(self.config.seed, e.seed, e.seed + 1, e.seed + 1000, e.seed + 1001),
+                budget=budget,
+            )
+        else:
+            certificate = certify(agent, None, name=name, budget=budget)
+        certificate.save(self.directory / "agent" / CERTIFICATE_FILE)
+        return certificate
+
     def run(self, *, resume: bool = True) -> ExperimentOutcome:
-        """Train, evaluate on fresh episodes, and report; everything lands in ``config.out_dir``.
+        """Train, evaluate on fresh episodes, certify, and report; everything lands in ``config.out_dir``.
 
         Args:
             resume: continue from a checkpoint in the directory, if there is one.
@@ -413,7 +437,8 @@ class Experiment:
         (self.directory / "config.json").write_text(json.dumps(self.config.to_dict(), indent=1) + "\n")
         agent = self.train(resume=resume)
         evaluation = evaluate_episodes(agent, self.make_env, self.config.evaluation)
-        outcome = ExperimentOutcome(self.directory, agent, evaluation, self.seconds, None, self.warnings)
+        certificate = self._certificate(agent)
+        outcome = ExperimentOutcome(self.directory, agent, evaluation, certificate, self.seconds, None, self.warnings)
         body = {"seed": self.config.seed, "training_seconds": self.seconds, "measurements": evaluation.to_dict(),
                 "lipschitz": {k: v for k, v in agent.description["lipschitz"].items() if k != "multipliers"},
                 "config": self.config.to_dict()}  # fmt: skip

@@ -189,7 +189,7 @@ class OptimConfig:
         target_tau: step of the delayed networks, where the loss has any.
     """
 
-    lr: float = 1e-3
+    lr: float = 3e-3
     schedule: str = "cosine"
     weight_decay: float = 0.0
     target_tau: float = 0.01
@@ -234,9 +234,9 @@ class TrainerConfig:
         progress: show a progress bar.
     """
 
-    total_frames: int = 32_000
-    optim_steps_per_batch: int = 64
-    warm_start_steps: int = 800
+    total_frames: int = 12_800
+    optim_steps_per_batch: int = 240
+    warm_start_steps: int = 1200
     clip_norm: float = 5.0
     checkpoint_every: int = 6400
     keep_checkpoints: int = 2
@@ -303,6 +303,9 @@ class EpisodesConfig:
         seed: seed of the evaluation's own random numbers.
         calibrate: shift the barrier so that it separates held-out S and U before anything is measured.
         guard: distance that held-out observations of U keep from the zero level (units of the barrier).
+        certificate_episodes: further episodes, as many under the policy as under random actions, behind what the
+            certificate measures (0: it says only what the weights prove).
+        certificate_seconds: after which each search for a proof gives up.
     """
 
     episodes: int = 200
@@ -311,6 +314,8 @@ class EpisodesConfig:
     seed: int = 20260101
     calibrate: bool = True
     guard: float = 0.02
+    certificate_episodes: int = 1000
+    certificate_seconds: float = 60.0
 
 
 @dataclass

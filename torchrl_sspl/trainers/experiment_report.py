@@ -82,20 +82,17 @@ def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str,
 
     Source: none.
     """
+    from torchrl_sspl.viz.certificate import certificate_section, proved_lines
     from torchrl_sspl.viz.report import write_report
 
     film = outcome.directory / "episode.gif"
     film.write_bytes(encode_gif(outcome.evaluation.arrays["own"].film))
-    proof = outcome.agent.description["lipschitz"]
-    bound = f"The deployed float32 barrier is {outcome.agent.lipschitz_bound:g}-Lipschitz on all of its domain"
     notes = [
         *(f"Warning: {text}." for text in outcome.warnings),
         f"Training took {outcome.seconds:.0f} s.",
         "No model of the environment is known: every figure counts fresh episodes from its own resets. Nothing is said "
         "about states that these do not reach.",
     ]
-    if not proof["proved"]:
-        notes.append(f"Not proved: {bound[0].lower() + bound[1:]}; {proof['reason']}.")
     config = experiment.config.to_dict()
     return write_report(
         outcome.directory / "report.html",
@@ -105,7 +102,8 @@ def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str,
         config={k: v for k, v in config.items() if v not in (None, {})},
         video=film,
         notes="\n\n".join(notes),
-        proved=[f"{bound} (exact integer arithmetic)."] if proof["proved"] else [],
+        proved=proved_lines(outcome.certificate),
+        certificate=certificate_section(outcome.certificate),
         assumed=[
             "The environment, its pictures and its resets stay as they were during the evaluation.",
             "Episodes are independent; observations within one are not, and carry no bound.",
