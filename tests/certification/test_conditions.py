@@ -118,6 +118,7 @@ def test_level_below_zero_is_found_where_zero_fails():
     assert level == pytest.approx(-0.2)
     assert outcome.status == "proved"
     assert search_level(system, levels=[0.0, -0.1]) is None
+    assert search_level(system, levels=[-2.0]) is None  # an empty set is kept, and worth nothing
     with pytest.raises(ConfigError, match="at most zero"):
         search_level(system, levels=[0.1])
 

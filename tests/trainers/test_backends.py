@@ -97,7 +97,7 @@ RUN = [
     "env.image_size=16", "network.pool_to=16", "network.latent_dim=2", "buffer.batch=96", "optim.lr=3e-3", "logger=none",
     "evaluation.episodes=200", "evaluation.envs=100", "evaluation.horizon=8", "evaluation.calibrate=false",
     "evaluation.certificate_episodes=0", "evaluation.certificate_seconds=1",
-    "synthesis.enabled=false",  # the joint training is compared
+    "trainer.warm_start_error=none", "synthesis.enabled=false",  # the joint training is compared
 ]  # fmt: skip
 
 

@@ -177,6 +177,21 @@ def test_warm_start_trains_the_world_model_alone() -> None:
     )
 
 
+@pytest.mark.parametrize(("error", "trained"), [(1e-6, False), (2.5, True)])
+def test_warm_start_goes_on_until_the_labels_are_told_apart(error: float, trained: bool) -> None:
+    trainer = build(warm_start_error=error)
+    before = weights(trainer)
+    trainer.train()
+    stepper = trainer.optimization_stepper
+    assert (stepper.mislabelled < 2.0) == (not trained)
+    moved = [not torch.equal(before[name], w) for name, w in weights(trainer).items() if name.startswith("actor_network_params")]
+    assert any(moved) == trained
+    other = SSPLStepper(torch.optim.Adam([torch.nn.Parameter(torch.zeros(1))]), warm_start_error=error)
+    state = {**stepper.state_dict(), "optimizer": other.state_dict()["optimizer"]}
+    other.load_state_dict(state)
+    assert other.mislabelled == stepper.mislabelled
+
+
 def test_lipschitz_step_stays_in_the_cone_and_keys_are_fixed() -> None:
     trainer = build(lmi=True)
     stepper = trainer.optimization_stepper
@@ -242,6 +257,8 @@ def test_wrong_arguments_are_named() -> None:
     optimizer = torch.optim.SGD([parameter], 0.1)
     with pytest.raises(ConfigError, match="lipschitz_loss and lipschitz_optimizer together"):
         SSPLStepper(optimizer, lipschitz_optimizer=optimizer)
+    with pytest.raises(ConfigError, match="warm_start_error > 0"):
+        SSPLStepper(optimizer, warm_start_error=0.0)
     with pytest.raises(ConfigError, match="warm_start_steps >= 0"):
         SSPLStepper(optimizer, warm_start_steps=-1)
     with pytest.raises(ConfigError, match="every >= 1"):

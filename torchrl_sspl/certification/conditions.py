@@ -419,7 +419,7 @@ def search_level(
         budget: when to give up on one level.
 
     Returns:
-        Level and outcome, or None if none is proved.
+        Level and outcome, or None if none is proved; an empty set is none.
 
     Raises:
         ConfigError: if a level is positive.
@@ -441,7 +441,8 @@ def search_level(
     for level in levels:
         outcome = decide_invariance(system, level=level, margin=margin, budget=budget)
         if outcome.status == "proved":
-            return level, outcome
+            # Nothing is easier to keep than nothing.
+            return None if decide_vacuity(system, level=level, budget=budget).status == "empty" else (level, outcome)
     return None
 
 

@@ -137,14 +137,19 @@ class ExperimentOutcome:
     report: Path | None
     warnings: list[str] = field(default_factory=list)
 
-    def summary(self) -> str:
-        """The main measurements as text."""
+    def measured(self) -> list[str]:
+        """The main measurements as sentences, with counts and exact 95 % bounds."""
         lines = []
         for name, label in SUMMARY:
             m = self.evaluation.measurements[name]
             value = "not measured" if m.value is None else f"{m.value:.2%} ({m.events} of {m.n})"
             bounds = "" if m.lower is None or m.upper is None else f", 95 % bounds {m.lower:.2%} to {m.upper:.2%}"
-            lines.append(f"{label:<52} {value}{bounds}")
+            lines.append(f"{label}: {value}{bounds}")
+        return lines
+
+    def summary(self) -> str:
+        """The main measurements, the certificate's verdicts and warnings as text."""
+        lines = self.measured()
         lines += [f"certificate, {layer.name} layer: {layer.verdict}" for layer in self.certificate.layers.values()]
         return "\n".join([*lines, f"training: {self.seconds:.0f} s", *(f"warning: {text}" for text in self.warnings)])
 
@@ -244,7 +249,7 @@ class Experiment:
             workers=c.workers,
             frames_per_batch=c.frames_per_batch,
             total_frames=t.total_frames,
-            init_random_frames=c.init_random_frames,
+            init_random_frames=config.random_frames(),
             max_frames_per_traj=c.max_frames_per_traj,
             policy_device=self.device,
             ray_address=c.ray_address,
@@ -263,6 +268,7 @@ class Experiment:
             replay_buffer=buffer,
             optim_steps_per_batch=t.optim_steps_per_batch,
             warm_start_steps=t.warm_start_steps,
+            warm_start_error=t.warm_start_error,
             target_net_updater=SoftUpdate(self.loss, tau=config.optim.target_tau) if delayed else None,
             rollout_policy=rollout_policy,
             evaluate=self._evaluate_during if t.evaluate_every else None,
@@ -277,7 +283,7 @@ class Experiment:
             progress_bar=t.progress,
         )
         if config.optim.schedule == "cosine":
-            batches, random = (math.ceil(n / c.frames_per_batch) for n in (t.total_frames, c.init_random_frames))
+            batches, random = (math.ceil(n / c.frames_per_batch) for n in (t.total_frames, config.random_frames()))
             steps = max(1, batches - max(random, 1) + 1) * t.optim_steps_per_batch
             schedule = torch.optim.lr_scheduler.LambdaLR(optimizer, partial(_cosine, steps))
             LRSchedulerHook(schedule, interval="optim").register(trainer)

@@ -15,6 +15,7 @@ from torchrl_sspl.trainers.config import TEACHERS, LatentConfig, NetworkConfig, 
 
 SCHEDULES = ("cosine", "constant")
 BACKENDS = ("sync", "process", "ray")
+_RANDOM_FRAMES = 6400
 AUTOCAST = ("none", "bfloat16", "float16")
 
 
@@ -143,7 +144,8 @@ class CollectorConfig:
         workers: collectors; more than one needs "process" or "ray".
         envs: environments per collector, stepped together.
         frames_per_batch: transitions per batch, over all collectors.
-        init_random_frames: transitions under random actions before learning starts.
+        init_random_frames: transitions under random actions before learning starts; "none" is half of
+            trainer.total_frames, 6400 at most.
         max_frames_per_traj: steps after which an episode is cut, so that many start; "none" leaves that to the environment.
         exploration: standard deviation of the noise on the policy's actions, as a share of the largest action.
         random_share: share of the environments that act at random all the time.
@@ -154,7 +156,7 @@ class CollectorConfig:
     workers: int = 1
     envs: int = 16
     frames_per_batch: int = 640
-    init_random_frames: int = 1280
+    init_random_frames: int | None = None
     max_frames_per_traj: int | None = 10
     exploration: float = 0.1
     random_share: float = 0.5
@@ -213,7 +215,9 @@ class ExperimentSynthesisConfig(LatentConfig):
     teach_steps: int = 1500
     fit_steps: int = 1500
     steer_steps: int = 300
-    tune_steps: int = 1500
+    tune_steps: int = 3000
+    margin: float = 0.1
+    counterexamples: int = 256
     batch: int = 512
 
 
@@ -225,6 +229,8 @@ class TrainerConfig:
         total_frames: transitions to collect.
         optim_steps_per_batch: optimiser steps per collected batch.
         warm_start_steps: of these, the first on the world model alone.
+        warm_start_error: share of S and U on the wrong side of the barrier, summed, down to which the world model alone goes
+            on being trained; "none" goes by the steps alone.
         clip_norm: bound on the norm of the gradient.
         checkpoint_every: transitions between checkpoints; negative for none.
         keep_checkpoints: checkpoints that are kept.
@@ -235,8 +241,9 @@ class TrainerConfig:
     """
 
     total_frames: int = 12_800
-    optim_steps_per_batch: int = 240
+    optim_steps_per_batch: int = 400
     warm_start_steps: int = 1200
+    warm_start_error: float | None = 0.05
     clip_norm: float = 5.0
     checkpoint_every: int = 6400
     keep_checkpoints: int = 2
@@ -358,6 +365,11 @@ class ExperimentConfig:
         """Nested dictionary of plain values."""
         return dataclasses.asdict(self)
 
+    def random_frames(self) -> int:
+        """Transitions under random actions before learning starts."""
+        given: int | None = self.collector.init_random_frames
+        return min(_RANDOM_FRAMES, self.trainer.total_frames // 2) if given is None else given
+
     def check(self) -> ExperimentConfig:
         """The configuration itself, after a look at values that do not go together.
 
@@ -383,6 +395,11 @@ class ExperimentConfig:
         if isinstance(self.trainer, TrainerConfig) and self.trainer.autocast not in AUTOCAST:
             raise ConfigError(
                 f"expected trainer.autocast to be one of {', '.join(AUTOCAST)}, received '{self.trainer.autocast}'"
+            )
+        if isinstance(self.trainer, TrainerConfig) and self.random_frames() > self.trainer.total_frames:
+            raise ConfigError(
+                f"expected collector.init_random_frames of at most trainer.total_frames={self.trainer.total_frames}, received "
+                f"{c.init_random_frames}: nothing would be learnt"
             )
         if self.optim.schedule not in SCHEDULES:
             raise ConfigError(

@@ -11,6 +11,7 @@ from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.trainers.loggers import encode_gif
 
 if TYPE_CHECKING:
+    from torchrl_sspl.certification.certificate import Certificate
     from torchrl_sspl.trainers.experiment import Experiment, ExperimentOutcome
 
 _SHOWN = 40
@@ -66,6 +67,16 @@ def draw(experiment: Experiment, outcome: ExperimentOutcome) -> dict[str, Any]:
     return figures
 
 
+def _headline(certificate: Certificate) -> tuple[str, str]:
+    """What the certificate says, in a line."""
+    for name in ("deterministic", "statistical"):
+        layer = certificate.layers.get(name)
+        if layer is not None and not layer.holds:
+            return f"{name.capitalize()} layer {layer.verdict}", "bad"
+    measured = "statistical" in certificate.layers
+    return ("Certified: proved and measured", "good") if measured else ("Proved, and not measured", "fair")
+
+
 def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str, Any]) -> Path:
     """Write ``report.html`` of an experiment.
 
@@ -102,6 +113,8 @@ def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str,
         config={k: v for k, v in config.items() if v not in (None, {})},
         video=film,
         notes="\n\n".join(notes),
+        headline=_headline(outcome.certificate),
+        measured=outcome.measured(),
         proved=proved_lines(outcome.certificate),
         certificate=certificate_section(outcome.certificate),
         assumed=[

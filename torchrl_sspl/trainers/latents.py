@@ -39,6 +39,8 @@ CHECKPOINT_FILE = "checkpoint.pt"
 _KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
 _ENCODE_CHUNK = 1000
+_SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerated, the first that keeps S
+_KEPT_OF_SAFE = 0.9
 _MOST_ACTIONS = 729  # in the grid that is tried at every latent
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 
@@ -459,11 +461,17 @@ class LatentTraining:
         assert self.taught is not None
         z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
         action = self.taught(z)
-        # What looks unsafe ends there, whatever follows: no errors are needed for it.
-        around = torch.zeros(len(z), *errors.shape[1:])
-        around[~unsafe] = errors
         margin = signed_margin(z, unsafe)
-        value = safety_values(self.dynamics(z, action)[:, None], z, margin, residuals=around)[:, 0].minimum(margin)
+        successors, safe = self.dynamics(z, action)[:, None], data["region"][:, 0] == SAFE
+        mean = errors[:, :1]
+        for share in _SPREADS:
+            # What looks unsafe ends there, whatever follows: no errors are needed for it.
+            around = torch.zeros(len(z), *errors.shape[1:])
+            around[~unsafe] = torch.lerp(mean, errors, share)
+            value = safety_values(successors, z, margin, residuals=around)[:, 0].minimum(margin)
+            # A set without S is worth nothing: rather tolerate less.
+            if int((value[safe] > 0).sum()) >= _KEPT_OF_SAFE * int(safe.sum()):
+                break
         target = value_targets(
             queries,
             z,
@@ -472,7 +480,7 @@ class LatentTraining:
             lipschitz_bound=self.config.network.lipschitz_bound,
         )
         self.kept_share = float((value[~unsafe] > 0).float().mean())
-        self._log({"step": 0, "inside_of_allowed": self.kept_share})
+        self._log({"step": 0, "inside_of_allowed": self.kept_share, "spread": share * self.config.synthesis.residual_spread})
         return target, target <= 0, action, torch.ones(len(z))
 
     def _errors(self, latent: Tensor, generator: torch.Generator, spread: float) -> tuple[Tensor, Tensor]:

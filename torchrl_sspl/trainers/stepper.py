@@ -31,13 +31,16 @@ WARM_TERMS = frozenset(
 class SSPLStepper(OptimizationStepper):
     r"""Steps of Algorithm 1: on the total loss, then on :math:`L_M` where the barrier needs it.
 
-    During the warm start only the terms of :math:`L_{SaLaD}` count. With a
+    During the warm start only the terms of :math:`L_{SaLaD}` count. What follows it asks for a barrier that is low where
+    the successor is inside: begun before the latents tell S from U, it would pull both below zero for good. With a
     :class:`~torchrl_sspl.objectives.LipschitzLoss` both steps are followed by a backtracking that
     keeps the barrier inside the cone in which its bound is certified.
 
     Args:
         optimizer: optimiser of the total loss.
         warm_start_steps: steps on the world model alone.
+        warm_start_error: the warm start goes on until S and U are told apart: until the running mean of ``safe_error`` +
+            ``unsafe_error`` (over about fifty steps) is at most this; ``None`` goes by the number of steps alone.
         lipschitz_loss: :math:`L_M`, for an :class:`~torchrl_sspl.lipschitz.LMIBarrier`; ``None`` for
             barriers that are Lipschitz by construction.
         lipschitz_optimizer: optimiser of :math:`L_M`; needed with ``lipschitz_loss``.
@@ -49,8 +52,8 @@ class SSPLStepper(OptimizationStepper):
         was kept). The keys do not vary.
 
     Raises:
-        ConfigError: if only one of ``lipschitz_loss`` and ``lipschitz_optimizer`` is given, or the
-            number of steps is negative.
+        ConfigError: if only one of ``lipschitz_loss`` and ``lipschitz_optimizer`` is given, the number of steps is
+            negative, or the error is not positive.
 
     Source: paper, Algorithm 1; deviation: the steps never leave the cone.
 
@@ -65,6 +68,7 @@ class SSPLStepper(OptimizationStepper):
         optimizer: torch.optim.Optimizer,
         *,
         warm_start_steps: int = 0,
+        warm_start_error: float | None = None,
         lipschitz_loss: LipschitzLoss | None = None,
         lipschitz_optimizer: torch.optim.Optimizer | None = None,
         autocast: torch.dtype | None = None,
@@ -76,9 +80,13 @@ class SSPLStepper(OptimizationStepper):
             )
         if warm_start_steps < 0:
             raise ConfigError(f"expected warm_start_steps >= 0, received {warm_start_steps}")
+        if warm_start_error is not None and not warm_start_error > 0:
+            raise ConfigError(f"expected warm_start_error > 0 or None, received {warm_start_error}")
         self.optimizer, self.lipschitz_optimizer = optimizer, lipschitz_optimizer
         self.lipschitz_loss = lipschitz_loss
         self.warm_start_steps, self.autocast, self.count = warm_start_steps, autocast, 0
+        self.warm_start_error = warm_start_error
+        self.mislabelled = 2.0  # running mean of the two errors; both are 1 at worst
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """One step on a batch of transitions.
@@ -90,13 +98,16 @@ class SSPLStepper(OptimizationStepper):
         Returns:
             Detached scalars.
         """
-        warm = self.count < self.warm_start_steps
+        blind = self.warm_start_error is not None and self.mislabelled > self.warm_start_error
+        warm = blind or self.count < self.warm_start_steps
         self.count += 1
         device = self.optimizer.param_groups[0]["params"][0].device.type
         with torch.autocast(device, dtype=self.autocast, enabled=self.autocast is not None):
             terms = trainer.compute_loss(sub_batch)
             counted = [v for k, v in terms.items() if k.startswith("loss_") and (not warm or k in WARM_TERMS)]
             total: Tensor = sum(counted)  # type: ignore[assignment]
+        if blind:
+            self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
         self.optimizer.zero_grad()
         total.backward()
         norm = self._clip(trainer)
@@ -144,15 +155,15 @@ class SSPLStepper(OptimizationStepper):
         return {**dict(terms.detach().items()), "lipschitz_share": torch.tensor(share)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Counter and both optimisers."""
-        state: dict[str, Any] = {"count": self.count, "optimizer": self.optimizer.state_dict()}
+        """Counter, progress of the warm start, and both optimisers."""
+        state: dict[str, Any] = {"count": self.count, "mislabelled": self.mislabelled, "optimizer": self.optimizer.state_dict()}
         if self.lipschitz_optimizer is not None:
             state["lipschitz_optimizer"] = self.lipschitz_optimizer.state_dict()
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
-        self.count = int(state_dict["count"])
+        self.count, self.mislabelled = int(state_dict["count"]), float(state_dict["mislabelled"])
         self.optimizer.load_state_dict(state_dict["optimizer"])
         if self.lipschitz_optimizer is not None:
             self.lipschitz_optimizer.load_state_dict(state_dict["lipschitz_optimizer"])

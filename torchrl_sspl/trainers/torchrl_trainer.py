@@ -45,6 +45,8 @@ class SSPLTrainer(Trainer):
         optim_steps_per_batch: steps per collected batch.
         frame_skip: environment steps per transition.
         warm_start_steps: steps on the world model alone, before everything else counts.
+        warm_start_error: share of S and U on the wrong side down to which the warm start goes on; ``None`` goes by the
+            steps alone.
         target_net_updater: updater of :math:`\theta^-`; needed if and only if the loss has delayed networks.
             ``None`` gives ``SoftUpdate(loss_module, tau=0.01)`` then.
         lipschitz_loss: :math:`L_M`, for an ``LMIBarrier``.
@@ -101,6 +103,7 @@ class SSPLTrainer(Trainer):
         optim_steps_per_batch: int,
         frame_skip: int = 1,
         warm_start_steps: int = 0,
+        warm_start_error: float | None = None,
         target_net_updater: TargetNetUpdater | None = None,
         lipschitz_loss: LipschitzLoss | None = None,
         lipschitz_optimizer: torch.optim.Optimizer | None = None,
@@ -137,6 +140,7 @@ class SSPLTrainer(Trainer):
         stepper = SSPLStepper(
             optimizer,
             warm_start_steps=warm_start_steps,
+            warm_start_error=warm_start_error,
             lipschitz_loss=lipschitz_loss,
             lipschitz_optimizer=lipschitz_optimizer,
             autocast=autocast,

@@ -322,6 +322,8 @@ def write_report(
     certificate: str | None = None,
     video: str | Path | None = None,
     notes: str = "",
+    headline: tuple[str, str] | None = None,
+    measured: Sequence[str] = (),
     proved: Sequence[str] = (),
     assumed: Sequence[str] | None = None,
 ) -> Path:
@@ -343,6 +345,8 @@ def write_report(
         certificate: section made by :func:`~torchrl_sspl.viz.certificate.certificate_section`.
         video: mp4, webm or gif file.
         notes: text, in paragraphs separated by empty lines.
+        headline: verdict and its kind ("good", "fair", "bad" or "none") where there is no summary.
+        measured: what was measured, as sentences, where there is no summary.
         proved: statements that are proved. Never derived from the measurements: pass what a proof has returned.
         assumed: what both rest on; default: what holds for every sampled figure.
 
@@ -364,8 +368,10 @@ def write_report(
     """
     data = {name: _plain(f"measurements[{name!r}]", m) for name, m in (measurements or {}).items()}
     config = dict(config or {})
-    headline, kind, rows_of_summary = _summary(summary, data)
-    measured = _measured_lines(summary, data)
+    title_line, kind, rows_of_summary = _summary(summary, data)
+    if not summary and headline is not None:
+        title_line, kind = headline
+    measured = _measured_lines(summary, data) or list(measured)
     columns = [
         ("Proved", list(proved) or ["Nothing is claimed as proved."]),
         ("Measured", measured or ["No share with a confidence bound."]),
@@ -381,7 +387,7 @@ def write_report(
 
     parts = [
         f"<header><h1>{escape(title)}</h1><p class='facts'>{escape(' / '.join(facts))}</p></header>",
-        f'<section class="verdict {kind}"><h2>{_BADGES[kind]} {escape(headline)}</h2><div class="columns">'
+        f'<section class="verdict {kind}"><h2>{_BADGES[kind]} {escape(title_line)}</h2><div class="columns">'
         + "".join(f"<div><h3>{name}</h3>{_list(items)}</div>" for name, items in columns)
         + "</div></section>",
     ]
