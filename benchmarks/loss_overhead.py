@@ -78,11 +78,12 @@ def bare_sound(nets: list[nn.Module]) -> Callable[[TensorDict], Tensor]:
         successor = frozen(dynamics, origin, policy(origin))
         now, then = barrier(torch.stack([origin, successor])).unbind(0)
         violation = then.clamp_min(0) * (0.1 - now).clamp_min(0) / 0.1
-        total = total + worst(violation[0].flatten()) + 0.1 * worst(violation[1].flatten())
+        synthesis = worst(violation[0].flatten()) + 0.1 * worst(violation[1].flatten())
         backed = (then[0].detach() <= 0) & (region != 2)
-        total = total + 0.1 * torch.where(backed, (now[0] + 0.3).clamp_min(0), 0.0).mean()
+        synthesis = synthesis + 0.1 * torch.where(backed, (now[0] + 0.3).clamp_min(0), 0.0).mean()
         weight = (-now[0].detach().clamp_min(0) / 0.2).exp()
-        return total + 0.1 * (weight * frozen(barrier, frozen(dynamics, still, policy(still)))).mean()
+        synthesis = synthesis + 0.1 * (weight * frozen(barrier, frozen(dynamics, still, policy(still)))).mean()
+        return total + 0.3 * synthesis
 
     return loss
 

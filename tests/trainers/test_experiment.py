@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+
 import gymnasium
 import numpy as np
 import pytest
@@ -205,14 +207,23 @@ def test_a_stopped_experiment_goes_on_to_the_same_agent(tmp_path, monkeypatch):
         assert torch.equal(value, weights[name]), name
 
 
-def test_what_follows_the_joint_training_starts_anew_on_other_data(tmp_path):
+def test_what_follows_the_joint_training_starts_anew_on_other_latents(tmp_path):
     build(tmp_path, "trainer.total_frames=128").train()
-    longer = build(tmp_path, "trainer.total_frames=256")
+    longer = build(tmp_path, "trainer.total_frames=256", "optim.schedule=constant")
     longer.train()
-    assert sorted(p.name for p in (tmp_path / "synthesis").iterdir()) == ["128", "256"]
-    changed = build(tmp_path, "trainer.total_frames=256", "synthesis.margin=0.2")
+    latents = torch.load(tmp_path / "synthesis" / "checkpoint.pt", weights_only=True)["latents"]
+    assert len(latents["latent"]) == 256
+    assert (tmp_path / "synthesis" / "log.jsonl").read_text().count('"phase": "teach"') == 1
+    changed = build(tmp_path, "trainer.total_frames=256", "optim.schedule=constant", "synthesis.margin=0.2")
     with pytest.raises(ConfigError, match="another one"):
         changed.train()
+    # An encoder trained anew in the same folder has other latents: what was trained on the old ones is not used.
+    shutil.rmtree(tmp_path / "checkpoints")
+    other = build(tmp_path, "trainer.total_frames=256", "seed=1")
+    agent = other.train()
+    seen = other.store.get(torch.arange(256))["frames"][:, :2].flatten(1, 2)
+    latents = torch.load(tmp_path / "synthesis" / "checkpoint.pt", weights_only=True)["latents"]
+    assert torch.equal(agent.encode(seen), latents["latent"])
 
 
 @pytest.mark.parametrize("never", ["safe", "unsafe"])

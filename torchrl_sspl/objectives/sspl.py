@@ -44,7 +44,7 @@ PRESETS: MappingProxyType[str, MappingProxyType[str, Any]] = MappingProxyType(
                 "growth_coeff": 0.1,
                 "off_manifold_coeff": 0.1,
                 "descent_coeff": 0.1,
-                "synthesis_coeff": 1.0,
+                "synthesis_coeff": 0.3,
                 "worst_coeff": 0.3,
                 "policy_coeff": 0.0,
                 "reduction": "mean",

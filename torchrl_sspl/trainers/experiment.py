@@ -360,8 +360,7 @@ class Experiment:
                 "what follows needs both kinds"
             )
             return
-        # Other data is another training, that begins anew.
-        self.synthesis_dir = self.directory / "synthesis" / str(self.trainer.collected_frames)
+        self.synthesis_dir = self.directory / "synthesis"
         settings = TrainingConfig(
             seed=config.seed,
             out_dir=str(self.synthesis_dir),

@@ -58,7 +58,7 @@ class LatentTraining:
         networks: ``"dynamics"``, ``"barrier"`` and ``"policy"``; trained in place.
         action_scale: largest action per dimension, physical units.
         latents: ``"latent"`` and ``"next_latent"`` ``(n, p)``, ``"action"`` ``(n, m)``, ``"region"`` ``(n, 1)`` codes.
-        resume: continue from the checkpoint in ``config.out_dir`` if there is one.
+        resume: continue from the checkpoint in ``config.out_dir`` if there is one of the same latents.
 
     Raises:
         ConfigError: if a checkpoint of another configuration is found.
@@ -102,8 +102,11 @@ class LatentTraining:
         self._rim: TensorDict
         self._last_checkpoint = time.monotonic()
         self._clock = time.monotonic()
-        if resume and (self.out_dir / CHECKPOINT_FILE).is_file():
-            self._restore()
+        if (self.out_dir / CHECKPOINT_FILE).is_file():
+            if resume:
+                self._restore()
+            else:
+                self._forget()
 
     # ------------------------------------------------------------------ schedule
 
@@ -547,6 +550,11 @@ class LatentTraining:
         torch.save(body, path.with_suffix(".tmp"))
         path.with_suffix(".tmp").replace(path)
 
+    def _forget(self) -> None:
+        """Start anew, whatever lies there."""
+        for name in (CHECKPOINT_FILE, "log.jsonl"):
+            (self.out_dir / name).unlink(missing_ok=True)
+
     def _more_state(self) -> dict[str, Any]:
         """What a derived training adds to its checkpoints."""
         return {}
@@ -569,6 +577,9 @@ class LatentTraining:
             raise CheckpointError(
                 f"expected a readable checkpoint at '{path}', received {type(error).__name__}; delete it to start again"
             ) from error
+        if self.latents and not _same(self.latents, body["latents"]):
+            self._forget()  # other data, or another encoder: another training
+            return
         if body["config"] != json.dumps(self._identity(), sort_keys=True):
             raise ConfigError(
                 f"expected the configuration of the run in '{self.out_dir}', received another one; use another out_dir, or "
@@ -609,6 +620,10 @@ def encode_transitions(loss: SSPLLoss, store: TransitionStore, index: Tensor | N
         parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"]))
     names = ("latent", "next_latent", "action", "region")
     return {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
+
+
+def _same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
+    return one.keys() == other.keys() and all(torch.equal(value, other[key]) for key, value in one.items())
 
 
 def _finite(value: float) -> bool:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
@@ -28,6 +29,17 @@ WARM_TERMS = frozenset(
 )
 
 
+@contextmanager
+def _without_worst(loss: nn.Module) -> Iterator[None]:
+    """The worst rows do not count extra: their mean is least for a barrier that is zero everywhere."""
+    kept = loss.worst_coeff
+    loss.worst_coeff = torch.zeros_like(kept)  # type: ignore[arg-type]
+    try:
+        yield
+    finally:
+        loss.worst_coeff = kept
+
+
 class SSPLStepper(OptimizationStepper):
     r"""Steps of Algorithm 1: on the total loss, then on :math:`L_M` where the barrier needs it.
 
@@ -40,7 +52,8 @@ class SSPLStepper(OptimizationStepper):
         optimizer: optimiser of the total loss.
         warm_start_steps: steps on the world model alone.
         warm_start_error: the warm start goes on until S and U are told apart: until the running mean of ``safe_error`` +
-            ``unsafe_error`` (over about fifty steps) is at most this; ``None`` goes by the number of steps alone.
+            ``unsafe_error`` (over about fifty steps) is at most this. Until then the worst rows do not count extra.
+            ``None`` goes by the number of steps alone.
         lipschitz_loss: :math:`L_M`, for an :class:`~torchrl_sspl.lipschitz.LMIBarrier`; ``None`` for
             barriers that are Lipschitz by construction.
         lipschitz_optimizer: optimiser of :math:`L_M`; needed with ``lipschitz_loss``.
@@ -102,7 +115,8 @@ class SSPLStepper(OptimizationStepper):
         warm = blind or self.count < self.warm_start_steps
         self.count += 1
         device = self.optimizer.param_groups[0]["params"][0].device.type
-        with torch.autocast(device, dtype=self.autocast, enabled=self.autocast is not None):
+        eased = _without_worst(trainer.loss_module) if blind else nullcontext()
+        with eased, torch.autocast(device, dtype=self.autocast, enabled=self.autocast is not None):
             terms = trainer.compute_loss(sub_batch)
             counted = [v for k, v in terms.items() if k.startswith("loss_") and (not warm or k in WARM_TERMS)]
             total: Tensor = sum(counted)  # type: ignore[assignment]
