@@ -118,6 +118,13 @@ def certify_on_episodes(
         The certificate.
 
     Source: paper Theorem 1; deviation: as for :func:`certify`.
+
+    Example:
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> from torchrl_sspl.modules.agent import load
+        >>> certificate = certify_on_episodes(load("pendulum"), PendulumEnv, episodes=4, horizon=3, envs=4)
+        >>> sorted(certificate.layers)
+        ['deterministic', 'paper', 'statistical']
     """
     certificate = _proved(agent, name, level, budget)
     env = make_env(batch_size=[envs], seed=seed)
