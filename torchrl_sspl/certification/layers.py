@@ -229,6 +229,7 @@ class Sample:
         fingerprints: of the labelled observations (see :func:`fingerprint`), to compare with those trained on.
         trained_on: fingerprints of the observations that were trained on, where they are at hand.
         rims: rows of a table: name of a part of the set, n steps, 99.9 % and largest error there.
+        starts: where the episodes began.
     """
 
     error: Tensor
@@ -241,6 +242,7 @@ class Sample:
     fingerprints: Sequence[str] = ()
     trained_on: Sequence[str] = ()
     rims: Sequence[tuple[str, int, float, float]] = ()
+    starts: str = "uniformly in the set"
 
 
 def fingerprint(observations: Tensor) -> list[str]:
@@ -403,7 +405,7 @@ def statistical_layer(
             )
         )
     for name, text in (
-        ("starts", "episodes start as the measured ones did: uniformly in the set"),
+        ("starts", f"episodes start as the measured ones did: {sample.starts}"),
         ("system", "camera, physics and appearance stay as they were"),
     ):
         add(Statement(name, text, ASSUMED, None))

@@ -244,6 +244,7 @@ def _measure_episodes(
         seed,
         used_seeds=used_seeds,
         rims=_rims(error, barrier[:-1], level),
+        starts="from those of the environment's resets that lie in the set",
     )
     safe = both["barrier"][(both["region"] == SAFE) & both["alive"]]
     inside = seen[own.barrier[own.alive] <= level]

@@ -124,7 +124,7 @@ class ExperimentOutcome:
         agent: the frozen agent.
         evaluation: measurements on fresh episodes.
         certificate: what is proved and what was measured; also in ``agent/certificate.json``.
-        seconds: wall-clock time of the training.
+        seconds: wall-clock time of the training, since it was resumed if it was.
         report: the page, or None where matplotlib is missing.
         warnings: what went wrong, and what to do about it.
     """
@@ -199,7 +199,7 @@ class Experiment:
         self.trainer = self._make_trainer()
         self.warnings: list[str] = []
         self.synthesis_dir: Path | None = None  # log and checkpoint of what follows the joint training
-        self.seconds = 0.0
+        self.seconds, self.resumed = 0.0, False
 
     def _make_networks(self, encoder: Callable[[int], nn.Module] | None) -> None:
         net, scale = self.config.network, (self._high - self._low) / 2
@@ -327,7 +327,7 @@ class Experiment:
         """
         began = time.monotonic()
         if resume and self.trainer.checkpoint_rotation is not None:
-            self.trainer.resume()
+            self.resumed = self.trainer.resume()
         if self.trainer.collected_frames < self.config.trainer.total_frames:
             try:
                 self.trainer.train()

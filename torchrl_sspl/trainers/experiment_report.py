@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from torchrl_sspl.trainers.experiment import Experiment, ExperimentOutcome
 
 _SHOWN = 40
+_FILM_SIZE = 240  # pixels
 
 
 def draw(experiment: Experiment, outcome: ExperimentOutcome) -> dict[str, Any]:
@@ -97,10 +98,12 @@ def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str,
     from torchrl_sspl.viz.report import write_report
 
     film = outcome.directory / "episode.gif"
-    film.write_bytes(encode_gif(outcome.evaluation.arrays["own"].film))
+    frames = outcome.evaluation.arrays["own"].film
+    larger = max(1, _FILM_SIZE // frames.shape[-1])  # what the agent sees may be tiny
+    film.write_bytes(encode_gif(frames.repeat_interleave(larger, -1).repeat_interleave(larger, -2)))
     notes = [
         *(f"Warning: {text}." for text in outcome.warnings),
-        f"Training took {outcome.seconds:.0f} s.",
+        f"Training took {outcome.seconds:.0f} s{' since it was resumed' if experiment.resumed else ''}.",
         "No model of the environment is known: every figure counts fresh episodes from its own resets. Nothing is said "
         "about states that these do not reach.",
     ]
@@ -112,6 +115,7 @@ def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str,
         figures=figures,
         config={k: v for k, v in config.items() if v not in (None, {})},
         video=film,
+        video_caption="One episode, as the agent sees it.",
         notes="\n\n".join(notes),
         headline=_headline(outcome.certificate),
         measured=outcome.measured(),

@@ -321,6 +321,7 @@ def write_report(
     checks: Sequence[Any] = (),
     certificate: str | None = None,
     video: str | Path | None = None,
+    video_caption: str = "One episode: what the agent sees, the true state, and the barrier value.",
     notes: str = "",
     headline: tuple[str, str] | None = None,
     measured: Sequence[str] = (),
@@ -344,6 +345,7 @@ def write_report(
         checks: held-out checks, one mapping or dataclass per round.
         certificate: section made by :func:`~torchrl_sspl.viz.certificate.certificate_section`.
         video: mp4, webm or gif file.
+        video_caption: what it shows.
         notes: text, in paragraphs separated by empty lines.
         headline: verdict and its kind ("good", "fair", "bad" or "none") where there is no summary.
         measured: what was measured, as sentences, where there is no summary.
@@ -400,7 +402,7 @@ def write_report(
         parts.append("<section><h2>Notes</h2>" + "".join(f"<p>{p}</p>" for p in paragraphs) + "</section>")
     if video is not None:
         uri, mime = _file_uri(video)
-        text = "One episode: what the agent sees, the true state, and the barrier value."
+        text = escape(video_caption)
         parts.append(
             f"<section><h2>Episode</h2><figure>{_media(uri, mime, text)}<figcaption>{text}</figcaption></figure></section>"
         )
