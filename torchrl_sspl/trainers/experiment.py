@@ -406,7 +406,14 @@ class Experiment:
             ]
         finally:
             env.close()
-        return separating_level(held_out, e.guard)
+        level = separating_level(held_out, e.guard)
+        if level < 0.0 and not bool((held_out[0].barrier[0] <= level).any()):
+            self.warnings.append(
+                f"no held-out reset lies in the set: its level was lowered to {level:.3g} to leave out every held-out observation "
+                "of U. Some of these look like S to the encoder: collect more data (trainer.total_frames), above all in U "
+                "(reset_options), show more of the motion (image_size), or try another seed"
+            )
+        return level
 
     def _certificate(self, agent: Agent) -> Certificate:
         e, name = self.config.evaluation, self.directory.name
