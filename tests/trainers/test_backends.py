@@ -92,12 +92,12 @@ def test_batches_and_weights_from_two_workers(backend):
 
 
 RUN = [
-    "trainer.total_frames=3200", "trainer.optim_steps_per_batch=64", "trainer.warm_start_steps=64", "trainer.progress=false",
+    "trainer.total_frames=3200", "trainer.optim_steps_per_batch=128", "trainer.warm_start_steps=128", "trainer.progress=false",
     "trainer.checkpoint_every=-1", "collector.frames_per_batch=640", "collector.envs=16", "collector.init_random_frames=640",
     "env.image_size=16", "network.pool_to=16", "network.latent_dim=2", "buffer.batch=96", "optim.lr=3e-3", "logger=none",
     "evaluation.episodes=200", "evaluation.envs=100", "evaluation.horizon=8", "evaluation.calibrate=false",
     "evaluation.certificate_episodes=0", "evaluation.certificate_seconds=1",
-    "trainer.warm_start_error=none", "synthesis.enabled=false",  # the joint training is compared
+    "trainer.warm_start_error=none", "optim.schedule=constant", "synthesis.enabled=false",  # the joint training is compared
 ]  # fmt: skip
 
 
