@@ -58,6 +58,7 @@ def test_from_the_simulator_to_the_report(name, tmp_path, monkeypatch):
     page = outcome.report.read_text()
     assert "Tiny" in page
     assert "data:image/gif" in page
+    assert "exact arithmetic on the deployed weights" in page
     assert "What the weights prove" in page
     assert "What fresh episodes show" in page
     assert "episodes from B &lt;= 0 that touch U" in page or "touch_unsafe" in page

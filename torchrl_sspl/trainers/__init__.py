@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:  # what readers of the source, type checkers among them, need to know
     from torchrl_sspl.trainers.certify import certify_on_episodes, verify_run
     from torchrl_sspl.trainers.config import TrainingConfig, make_config
+    from torchrl_sspl.trainers.encoding import encode_transitions
     from torchrl_sspl.trainers.episodes import evaluate_episodes
     from torchrl_sspl.trainers.evaluation import evaluate, rollout
     from torchrl_sspl.trainers.experiment import Experiment, run_experiment
-    from torchrl_sspl.trainers.latents import LatentTraining, encode_transitions
+    from torchrl_sspl.trainers.latents import LatentTraining
     from torchrl_sspl.trainers.paper import PaperTraining
     from torchrl_sspl.trainers.pipeline import SafePolicyTraining
     from torchrl_sspl.trainers.run import train
@@ -29,7 +30,7 @@ _NAMES = {
     "certify_on_episodes": "certify",
     "verify_run": "certify",
     "LatentTraining": "latents",
-    "encode_transitions": "latents",
+    "encode_transitions": "encoding",
     "Experiment": "experiment",
     "run_experiment": "experiment",
     "evaluate_episodes": "episodes",

@@ -147,6 +147,11 @@ class LatentConfig:
     unsafe_margin: float = 0.05
     recovery_coeff: float = 0.3
 
+    def check(self) -> None:
+        """Raises ``ConfigError`` if the teacher is unknown."""
+        if self.teacher not in TEACHERS:
+            raise ConfigError(f"expected synthesis.teacher to be one of {', '.join(TEACHERS)}, received '{self.teacher}'")
+
 
 @dataclass
 class SynthesisConfig(LatentConfig):

@@ -34,10 +34,11 @@ from torchrl_sspl.objectives import SSPLLoss
 from torchrl_sspl.sets import UNLABELLED, UNSAFE
 from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, certify, certify_on_episodes
 from torchrl_sspl.trainers.config import LatentConfig, SynthesisConfig, TrainingConfig
+from torchrl_sspl.trainers.encoding import encode_transitions
 from torchrl_sspl.trainers.episodes import evaluate_episodes, logged, random_actions, run_episodes, separating_level
 from torchrl_sspl.trainers.evaluation import Evaluation
 from torchrl_sspl.trainers.experiment_config import EnvFactory, ExperimentConfig, resolve
-from torchrl_sspl.trainers.latents import LatentTraining, encode_transitions
+from torchrl_sspl.trainers.latents import LatentTraining
 from torchrl_sspl.trainers.loggers import close_logger, log_figure, log_scalars, log_video, make_logger
 from torchrl_sspl.trainers.torchrl_trainer import SSPLTrainer
 
@@ -352,7 +353,7 @@ class Experiment:
         if not s.enabled or config.loss.preset == "paper":
             return
         index = self._transitions(s.transitions)
-        latents = encode_transitions(self.loss, self.store, index)
+        latents = encode_transitions(lambda batch: self.loss.latents(batch.to(self.device)), self.store, index)
         unsafe = int((latents["region"] == UNSAFE).sum())
         if unsafe in (0, len(index)):
             self.warnings.append(

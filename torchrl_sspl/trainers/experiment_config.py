@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.trainers.config import TEACHERS, LatentConfig, NetworkConfig, _assign
+from torchrl_sspl.trainers.config import LatentConfig, NetworkConfig, _assign
 
 SCHEDULES = ("cosine", "constant")
 BACKENDS = ("sync", "process", "ray")
@@ -405,10 +405,7 @@ class ExperimentConfig:
             raise ConfigError(
                 f"expected optim.schedule to be one of {', '.join(SCHEDULES)}, received '{self.optim.schedule}'"
             )
-        if self.synthesis.teacher not in TEACHERS:
-            raise ConfigError(
-                f"expected synthesis.teacher to be one of {', '.join(TEACHERS)}, received '{self.synthesis.teacher}'"
-            )
+        self.synthesis.check()
         if self.loss.preset not in ("sound", "paper"):
             raise ConfigError(f"expected loss.preset to be sound or paper, received '{self.loss.preset}'")
         return self

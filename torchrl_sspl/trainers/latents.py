@@ -17,9 +17,8 @@ from torchrl.objectives import SoftUpdate
 from tqdm import tqdm
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
-from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.errors import CheckpointError, ConfigError
-from torchrl_sspl.objectives import ActionValueLoss, SSPLLoss, SynthesisLoss, TargetLoss
+from torchrl_sspl.objectives import ActionValueLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.latent_viability import (
     barrier_targets,
     nearby_residuals,
@@ -32,13 +31,12 @@ from torchrl_sspl.objectives.latent_viability import (
     value_targets,
 )
 from torchrl_sspl.sets import SAFE, UNSAFE
-from torchrl_sspl.trainers.config import TEACHERS, TrainingConfig
+from torchrl_sspl.trainers.config import TrainingConfig
 from torchrl_sspl.trainers.loggers import METRICS, log_scalars
 
 CHECKPOINT_FILE = "checkpoint.pt"
 _KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
-_ENCODE_CHUNK = 1000
 _SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerated, the first that keeps S
 _KEPT_OF_SAFE = 0.9
 _MOST_ACTIONS = 729  # in the grid that is tried at every latent
@@ -80,10 +78,7 @@ class LatentTraining:
         resume: bool = True,
     ) -> None:
         self.config, self.action_scale = config, list(action_scale)
-        if config.synthesis.teacher not in TEACHERS:
-            raise ConfigError(
-                f"expected synthesis.teacher to be one of {', '.join(TEACHERS)}, received '{config.synthesis.teacher}'"
-            )
+        config.synthesis.check()
         self.out_dir = Path(config.out_dir)
         self.out_dir.mkdir(parents=True, exist_ok=True)
         self.networks = nn.ModuleDict(networks)
@@ -595,31 +590,6 @@ class LatentTraining:
         self.generator.set_state(body["generator"])
         self.phase, self.step, self.seconds = body["phase"], body["step"], body["seconds"]
         self._loop_state = body["loop"]
-
-
-
-@torch.no_grad()
-def encode_transitions(loss: SSPLLoss, store: TransitionStore, index: Tensor | None = None) -> dict[str, Tensor]:
-    """Latents of stored transitions, under the encoder of a loss.
-
-    Args:
-        loss: encodes; on any device.
-        store: transitions.
-        index: ``(n,)`` which of them; by default all.
-
-    Returns:
-        What :class:`LatentTraining` takes: ``"latent"``, ``"next_latent"``, ``"action"`` and ``"region"``, on the CPU.
-
-    Source: none.
-    """
-    device = next(loss.parameters()).device
-    parts = []
-    for rows in (torch.arange(len(store)) if index is None else index).split(_ENCODE_CHUNK):
-        batch = store.get(rows)
-        latent, after = loss.latents(batch.to(device))
-        parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"]))
-    names = ("latent", "next_latent", "action", "region")
-    return {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
 
 
 def _same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:

@@ -26,10 +26,10 @@ from torchrl_sspl.modules.agent import ENCODERS, Agent
 from torchrl_sspl.objectives import SaLaDLoss
 from torchrl_sspl.sets import Region
 from torchrl_sspl.trainers.config import TrainingConfig
+from torchrl_sspl.trainers.encoding import encode_transitions
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
 from torchrl_sspl.trainers.latents import LatentTraining
 
-_ENCODE_CHUNK = 1000
 _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
 
 
@@ -345,15 +345,8 @@ class SafePolicyTraining(LatentTraining):
         store = collect_random(self._env_for(), n, seed=seed, steps=steps, region=region)
         return self._encode_store(store)
 
-    @torch.no_grad()
-    def _encode_store(self, store) -> dict[str, Tensor]:
-        parts = []
-        for index in torch.arange(len(store)).split(_ENCODE_CHUNK):
-            batch = store.get(index)
-            latent = self.encoder.sequence(batch["frames"])
-            parts.append((latent[:, 0], batch["action"], latent[:, 1], batch["region"]))
-        names = ("latent", "action", "next_latent", "region")
-        return {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
+    def _encode_store(self, store: TransitionStore) -> dict[str, Tensor]:
+        return encode_transitions(lambda batch: self.encoder.sequence(batch["frames"]).unbind(1), store)
 
     # ------------------------------------------------------------------ agent
 
