@@ -14,7 +14,7 @@ TINY = [
 
 # Of an experiment: what follows the joint training, and the certificate.
 TINY_EXPERIMENT = [
-    "evaluation.certificate_episodes=4", "evaluation.certificate_seconds=2",
+    "trainer.restarts=0", "evaluation.certificate_episodes=4", "evaluation.certificate_seconds=2",
     "synthesis.dynamics_steps=4", "synthesis.teach_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=3",
     "synthesis.tune_steps=3", "synthesis.batch=32", "synthesis.residuals=2", "synthesis.actions=3",
 ]  # fmt: skip

@@ -178,8 +178,28 @@ def test_what_cannot_work_is_refused():
         GymnasiumPixels(Slider, safe=bool, unsafe=bool, image_size=2)
 
 
-def test_an_observation_that_is_no_vector_is_left_out():
-    class Picture(Slider):
-        observation_space = spaces.Box(0, 255, (4, 4, 3), np.uint8)
+class Camera(Slider):
+    """Observes the picture; what it would render shows more."""
 
-    assert "state" not in slider(make=Picture).observation_spec
+    observation_space = spaces.Box(0, 255, (32, 32, 3), np.uint8)
+    render_mode = None
+
+    def reset(self, *, seed=None, options=None):
+        info = super().reset(seed=seed, options=options)[1]
+        return Slider.render(self), info
+
+    def step(self, action):
+        rest = super().step(action)[1:]
+        return Slider.render(self), *rest
+
+    def render(self):
+        raise AssertionError
+
+
+def test_an_observation_that_is_a_picture_is_what_the_networks_see():
+    env = slider(1, make=Camera, reset_options={"x": 6.0}, settle=False, unsafe=lambda picture, info: info["x"] > 10)
+    assert "state" not in env.observation_spec
+    check_env_specs(env)
+    data = env.rollout(3, policy=lambda td: td.set("action", torch.full((1, 1), 1.0)))
+    assert position(data["pixels"][0, :, :3]).tolist() == [6, 6, 7]
+    assert position(data["next", "pixels"][0, :, 3:]).tolist() == [7, 8, 9]

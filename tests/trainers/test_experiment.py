@@ -177,9 +177,11 @@ class Stopped(Exception):
     pass
 
 
-def test_a_stopped_experiment_goes_on_to_the_same_agent(tmp_path, monkeypatch):
-    straight = build(tmp_path / "straight", "trainer.total_frames=256").train()
-    first = build(tmp_path / "stopped", "trainer.total_frames=256")
+@pytest.mark.parametrize("restarts", [0, 1])
+def test_a_stopped_experiment_goes_on_to_the_same_agent(restarts, tmp_path, monkeypatch):
+    words = ["trainer.total_frames=256", f"trainer.restarts={restarts}"]
+    straight = build(tmp_path / "straight", *words).train()
+    first = build(tmp_path / "stopped", *words)
 
     def stop_in_third_batch(batch):
         if first.trainer.collected_frames > 128:
@@ -189,7 +191,7 @@ def test_a_stopped_experiment_goes_on_to_the_same_agent(tmp_path, monkeypatch):
     first.trainer.register_op("batch_process", stop_in_third_batch)
     with pytest.raises(Stopped):
         first.train()
-    second = build(tmp_path / "stopped", "trainer.total_frames=256")
+    second = build(tmp_path / "stopped", *words)
 
     def stop_in_tune(training):
         if training.phases()[training.phase][0] == "tune":
@@ -200,11 +202,29 @@ def test_a_stopped_experiment_goes_on_to_the_same_agent(tmp_path, monkeypatch):
         with pytest.raises(Stopped):
             second.train()
     assert second.trainer.collected_frames == 256
-    third = build(tmp_path / "stopped", "trainer.total_frames=256")
+    third = build(tmp_path / "stopped", *words)
     weights = third.train().state_dict()
-    assert third.trainer.optimization_stepper.count == 2 * 4
+    assert third.trainer.optimization_stepper.count == 2 * (4 - restarts)  # the fresh start forgets the first batch's steps
     for name, value in straight.state_dict().items():
         assert torch.equal(value, weights[name]), name
+
+
+def test_without_success_it_starts_again_with_other_weights_and_says_so(tmp_path):
+    words = ["trainer.total_frames=320", "trainer.restarts=2", "optim.lr=0.0", "synthesis.enabled=false"]
+    experiment = build(tmp_path, *words)
+    starts = []
+    experiment.trainer.register_op("post_steps", lambda: starts.append(next(experiment.encoder.parameters()).sum().item()))
+    experiment.train()
+    assert experiment.trainer.optimization_stepper.count == 2 * 3  # batches 1, 2, 3 to 5
+    assert (len(starts), len(set(starts))) == (5, 3)
+    assert any("did not tell S from U" in text for text in experiment.warnings)
+    # The same with labels that the first weights tell apart: none of it happens.
+    content = build(tmp_path / "content", *words, "trainer.warm_start_error=2.5")
+    content.train()
+    assert content.trainer.optimization_stepper.count == 2 * 5
+    assert not any("did not tell S from U" in text for text in content.warnings)
+    # A barrier that never learnt leaves no set: the level that excludes U excludes every reset, and this is said too.
+    assert any("no held-out reset lies in the set" in text for text in content.warnings)
 
 
 def test_what_follows_the_joint_training_starts_anew_on_other_latents(tmp_path):

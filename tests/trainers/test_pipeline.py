@@ -13,7 +13,7 @@ from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.trainers.config import make_config
 from torchrl_sspl.trainers.evaluation import evaluate
-from torchrl_sspl.trainers.latents import CHECKPOINT_FILE
+from torchrl_sspl.trainers.latents import CHECKPOINT_FILE, _action_grid
 from torchrl_sspl.trainers.pipeline import Check, SafePolicyTraining
 
 
@@ -144,3 +144,16 @@ def test_counterexamples_of_the_whole_domain_are_found_and_trained_on(uninterrup
     found = trained.counterexamples
     assert 0 < len(found) <= 8
     assert bool((found.abs() <= 1).all())
+
+
+@pytest.mark.parametrize(("dimensions", "per_dimension"), [(1, 7), (2, 7), (3, 7), (4, 5), (6, 3), (12, 2)])
+def test_the_grid_of_actions_gets_coarser_with_their_dimension(dimensions, per_dimension):
+    grid = _action_grid([2.0] * dimensions, 7)
+    assert grid.shape == (per_dimension**dimensions, dimensions)
+    assert grid.min(0).values.tolist() == [-2.0] * dimensions
+    assert grid.max(0).values.tolist() == [2.0] * dimensions
+
+
+def test_too_many_dimensions_of_the_action_are_named():
+    with pytest.raises(ConfigError, match="at most 12 action dimensions, received 13"):
+        _action_grid([1.0] * 13, 7)

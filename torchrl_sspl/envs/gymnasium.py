@@ -24,7 +24,8 @@ _ATTEMPTS = 20
 class GymnasiumPixels(EnvBase):
     r"""A gymnasium environment seen through its own pictures, labelled by two predicates.
 
-    The networks see pixels only. The predicates see what gymnasium returns, its observation and its info, and
+    The networks see pixels only: gymnasium's observation where that is a uint8 picture (height, width, 3), else what it
+    renders. The predicates see what gymnasium returns, its observation and its info, and
     are asked after every step; what neither of them claims is unlabelled. Output keys, for ``batch_size=[n]``:
 
     ========== ============================ ==============================================================
@@ -45,7 +46,7 @@ class GymnasiumPixels(EnvBase):
     at rest, ``settle=False`` leaves the step out, and the two first frames are the same.
 
     Args:
-        make: ``() -> gymnasium.Env`` with ``render_mode="rgb_array"``; called n times.
+        make: ``() -> gymnasium.Env``, with ``render_mode="rgb_array"`` unless it observes pictures; called n times.
         safe: ``(observation, info) -> bool``, the set S.
         unsafe: ``(observation, info) -> bool``, the set U.
         batch_size: ``[n]`` environments, stepped one after the other.
@@ -114,14 +115,16 @@ class GymnasiumPixels(EnvBase):
         self._safe, self._unsafe = safe, unsafe
         self._envs = [make() for _ in range(size[0])]
         first = self._envs[0]
-        if getattr(first, "render_mode", None) != "rgb_array":
+        space = first.observation_space
+        shape: tuple[int, ...] = getattr(space, "shape", None) or ()
+        self._observes_pictures = len(shape) == 3 and shape[2] == 3 and space.dtype == np.uint8
+        if not self._observes_pictures and getattr(first, "render_mode", None) != "rgb_array":
             raise ConfigError(
                 f"make: expected an environment with render_mode='rgb_array', received "
                 f"{getattr(first, 'render_mode', None)!r}; give it to gymnasium.make."
             )
         self._read_action_space(first.action_space)
-        shape = getattr(first.observation_space, "shape", None)
-        self.state_dim = shape[0] if shape is not None and len(shape) == 1 else 0
+        self.state_dim = shape[0] if len(shape) == 1 else 0
         self._make_specs()
         self._random = np.random.default_rng(seed)
         n = size[0]
@@ -179,8 +182,9 @@ class GymnasiumPixels(EnvBase):
 
     # -- one environment -------------------------------------------------------------------------------
 
-    def _draw(self, index: int) -> Tensor:
-        picture = np.array(self._envs[index].render())  # a copy: some renderers draw into the same memory again
+    def _draw(self, index: int, observation: Any) -> Tensor:
+        shown = observation if self._observes_pictures else self._envs[index].render()
+        picture = np.array(shown)  # a copy: some renderers draw into the same memory again
         if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
             raise ConfigError(
                 f"render: expected a uint8 picture (height, width, 3), received {picture.dtype} {picture.shape}."
@@ -218,7 +222,7 @@ class GymnasiumPixels(EnvBase):
             options = self.reset_options(self._random) if callable(self.reset_options) else self.reset_options
             seed = int(self._random.integers(2**31 - 1))
             observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
-            before = self._draw(index)
+            before = self._draw(index, observation)
             if not self.settle:
                 break
             observation, _, terminated, truncated, info = self._advance(env, np.zeros(self.action_dim))
@@ -228,7 +232,7 @@ class GymnasiumPixels(EnvBase):
             raise ConfigError(
                 f"reset: expected an episode that survives one step, received {_ATTEMPTS} that did not; change reset_options."
             )
-        self._frame[index] = self._draw(index)
+        self._frame[index] = self._draw(index, observation)
         self._steps[index] = 0
         self._last[index] = self._row(observation, info)
         return before
@@ -260,7 +264,7 @@ class GymnasiumPixels(EnvBase):
         rewards, ended, cut = [], [], []
         for k, env in enumerate(self._envs):
             observation, reward, terminated, truncated, info = self._advance(env, actions[k])
-            self._frame[k] = self._draw(k)
+            self._frame[k] = self._draw(k, observation)
             self._steps[k] += 1
             self._last[k] = self._row(observation, info)
             rewards.append(reward)

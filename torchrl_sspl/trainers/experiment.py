@@ -38,6 +38,7 @@ from torchrl_sspl.trainers.encoding import encode_transitions
 from torchrl_sspl.trainers.episodes import evaluate_episodes, logged, random_actions, run_episodes, separating_level
 from torchrl_sspl.trainers.evaluation import Evaluation
 from torchrl_sspl.trainers.experiment_config import EnvFactory, ExperimentConfig, resolve
+from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.latents import LatentTraining
 from torchrl_sspl.trainers.loggers import close_logger, log_figure, log_scalars, log_video, make_logger
 from torchrl_sspl.trainers.torchrl_trainer import SSPLTrainer
@@ -193,7 +194,12 @@ class Experiment:
         self._low, self._high = space.low.cpu().float(), space.high.cpu().float()
         env.close()
         torch.manual_seed(config.seed)
-        self._make_networks(encoder)
+        scale = (self._high - self._low) / 2
+        self._given = encoder or (resolve(config.network.encoder) if config.network.encoder else None)
+        self._sizes = {"latent_dim": config.network.latent_dim, "action_dim": len(scale), "action_scale": scale.tolist()}
+        self.encoder, self.dynamics, self.barrier, self.policy = self._networks()
+        self.description = self._describe()
+        self.loss = self._loss(self.encoder, self.dynamics, self.barrier, self.policy)
         self.logger = make_logger(
             config.logger.kind, config.logger.kind, self.directory, **_project(config.logger)
         )
@@ -202,43 +208,47 @@ class Experiment:
         self.synthesis_dir: Path | None = None  # log and checkpoint of what follows the joint training
         self.seconds, self.resumed = 0.0, False
 
-    def _make_networks(self, encoder: Callable[[int], nn.Module] | None) -> None:
-        net, scale = self.config.network, (self._high - self._low) / 2
-        dim = len(scale)
-        if encoder is None and net.encoder:
-            encoder = resolve(net.encoder)
-        if encoder is None:
-            arguments: dict[str, Any] = {
-                "latent_dim": net.latent_dim, "pool_to": net.pool_to, "velocity_gain": net.velocity_gain
-            }  # fmt: skip
-            self.encoder: nn.Module = FrameEncoder(**arguments)
-            name = "FrameEncoder"
+    def _networks(self) -> tuple[nn.Module, LatentDynamics, SandwichBarrier, Policy]:
+        net = self.config.network
+        if self._given is None:
+            encoder: nn.Module = FrameEncoder(net.latent_dim, pool_to=net.pool_to, velocity_gain=net.velocity_gain)
         else:
-            arguments = {"latent_dim": net.latent_dim}
-            self.encoder = encoder(net.latent_dim)
-            name = getattr(encoder, "__name__", type(self.encoder).__name__)
-        sizes = {"latent_dim": net.latent_dim, "action_dim": dim, "action_scale": scale.tolist()}
-        self.dynamics = LatentDynamics(hidden=net.dynamics_hidden, **sizes)
-        self.policy = Policy(hidden=net.policy_hidden, **sizes)
-        self.barrier = SandwichBarrier(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
-        for module in (self.encoder, self.dynamics, self.policy, self.barrier):
-            module.to(self.device)
-        self.description: dict[str, Any] = {
+            encoder = self._given(net.latent_dim)
+        dynamics = LatentDynamics(hidden=net.dynamics_hidden, **self._sizes)
+        policy = Policy(hidden=net.policy_hidden, **self._sizes)
+        barrier = SandwichBarrier(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
+        return encoder.to(self.device), dynamics.to(self.device), barrier.to(self.device), policy.to(self.device)
+
+    def _describe(self) -> dict[str, Any]:
+        """What an agent's file says: which networks to build before their weights are loaded."""
+        net, name = self.config.network, getattr(self._given, "__name__", type(self.encoder).__name__)
+        arguments: dict[str, Any] = {"latent_dim": net.latent_dim}
+        if self._given is None:
+            arguments |= {"pool_to": net.pool_to, "velocity_gain": net.velocity_gain}
+        return {
             "networks": {
                 "encoder": {"class": name, "arguments": arguments},
-                "dynamics": {"class": "LatentDynamics", "arguments": {**sizes, "hidden": list(net.dynamics_hidden)}},
-                "policy": {"class": "Policy", "arguments": {**sizes, "hidden": list(net.policy_hidden)}},
+                "dynamics": {"class": "LatentDynamics", "arguments": {**self._sizes, "hidden": list(net.dynamics_hidden)}},
+                "policy": {"class": "Policy", "arguments": {**self._sizes, "hidden": list(net.policy_hidden)}},
                 "barrier": {"latent_dim": net.latent_dim, "hidden": list(net.barrier_hidden)},
             },
             "experiment": self.config.to_dict(),
         }
 
+    def _loss(self, *networks: nn.Module) -> SSPLLoss:
+        options = {k: v for k, v in vars(self.config.loss).items() if v is not None}
+        return SSPLLoss(*networks, **options).to(self.device)
+
+    def _fresh(self, attempt: int) -> SSPLLoss:
+        with torch.random.fork_rng():
+            torch.manual_seed(self.config.seed + 1000 * attempt)
+            return self._loss(*self._networks())
+
     def _make_trainer(self) -> SSPLTrainer:
         config, t, c = self.config, self.config.trainer, self.config.collector
-        options = {k: v for k, v in vars(config.loss).items() if v is not None}
-        self.loss = SSPLLoss(self.encoder, self.dynamics, self.barrier, self.policy, **options).to(self.device)
         if t.compile:
             self.loss.compile()
+        assert self.loss.encoder is not None
         rollout_policy = ExploringPolicy(
             make_rollout_policy(self.loss.encoder, self.loss.actor_network),
             self._low, self._high, c.exploration, c.random_share,
@@ -283,6 +293,8 @@ class Experiment:
             log_interval=0,
             progress_bar=t.progress,
         )
+        if t.restarts and t.warm_start_error is not None and t.warm_start_steps:
+            RestartHook(trainer, self._fresh, after=t.warm_start_steps, most=t.restarts).register(trainer)
         if config.optim.schedule == "cosine":
             batches, random = (math.ceil(n / c.frames_per_batch) for n in (t.total_frames, config.random_frames()))
             steps = max(1, batches - max(random, 1) + 1) * t.optim_steps_per_batch
@@ -350,6 +362,12 @@ class Experiment:
         """Dynamics, policy and barrier once more, on latents that stand still: what moves under them no longer does."""
         config, s = self.config, self.config.synthesis
         self.warnings = []
+        if self.trainer.optimization_stepper.blind:
+            self.warnings.append(
+                "the joint training did not tell S from U: what they differ in may be too small in the pictures (image_size, "
+                "network.pool_to) or too rare in the data (trainer.total_frames, reset_options), or the latent is filled with "
+                "other things that move (network.latent_dim)"
+            )
         if not s.enabled or config.loss.preset == "paper":
             return
         index = self._transitions(s.transitions)

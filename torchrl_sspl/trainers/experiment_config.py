@@ -231,6 +231,8 @@ class TrainerConfig:
         warm_start_steps: of these, the first on the world model alone.
         warm_start_error: share of S and U on the wrong side of the barrier, summed, down to which the world model alone goes
             on being trained; "none" goes by the steps alone.
+        restarts: fresh starts with other initial weights, at most, where the warm start is over and S and U are not told apart
+            (by warm_start_error); 0 for none.
         clip_norm: bound on the norm of the gradient.
         checkpoint_every: transitions between checkpoints; negative for none.
         keep_checkpoints: checkpoints that are kept.
@@ -244,6 +246,7 @@ class TrainerConfig:
     optim_steps_per_batch: int = 400
     warm_start_steps: int = 1200
     warm_start_error: float | None = 0.05
+    restarts: int = 2
     clip_norm: float = 5.0
     checkpoint_every: int = 6400
     keep_checkpoints: int = 2

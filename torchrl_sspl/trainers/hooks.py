@@ -1,4 +1,4 @@
-"""Hooks of the TorchRL trainer: margins, seeds, evaluation, stop on a certificate, figures."""
+"""Hooks of the TorchRL trainer: margins, seeds, fresh starts, evaluation, stop on a certificate, figures."""
 
 from __future__ import annotations
 
@@ -162,6 +162,67 @@ class SeedHook(TrainerHookBase):
         """Attaches the hook to ``setup`` and ``post_steps``."""
         trainer.register_op("setup", self.setup)
         trainer.register_op("post_steps", self)
+        trainer.register_module(name, self)
+
+
+class RestartHook(TrainerHookBase):
+    """Begins again with fresh weights where the warm start does not tell S from U.
+
+    Joint training of encoder and barrier has poor local optima: latents that predict well and leave out what S and U differ
+    in. No number of further steps leads out of them; other initial weights mostly do. Before the steps of every collected
+    batch, the hook looks at the stepper; the data are kept, the steps are gone.
+
+    Args:
+        trainer: the trainer; its stepper has a ``warm_start_error``.
+        fresh: ``attempt -> loss`` like the trainer's, with other initial weights; attempts count from 1.
+        after: optimiser steps since the last start, after which S and U have to be told apart.
+        most: fresh starts at most.
+
+    Raises:
+        ConfigError: if a number is not positive.
+
+    Source: none; the paper does not start again.
+
+    Example:
+        >>> RestartHook(None, lambda attempt: None, after=1200, most=2).state_dict()
+        {'restarts': 0}
+    """
+
+    def __init__(self, trainer: Any, fresh: Callable[[int], SSPLLoss], *, after: int, most: int) -> None:
+        if after < 1 or most < 1:
+            raise ConfigError(f"expected after >= 1 steps and most >= 1 restarts, received {after} and {most}")
+        self.trainer, self.fresh, self.after, self.most, self.restarts = trainer, fresh, after, most, 0
+
+    @torch.no_grad()
+    def __call__(self) -> None:
+        """Looks, and begins again if need be."""
+        stepper = self.trainer.optimization_stepper
+        if not stepper.blind or stepper.count < self.after or self.restarts == self.most:
+            return
+        self.restarts += 1
+        loss = self.trainer.loss_module
+        margins = {name: getattr(loss, name).clone() for name in MARGINS}
+        loss.load_state_dict(self.fresh(self.restarts).state_dict())  # in place: optimiser and collector keep their hold
+        for name, value in margins.items():
+            getattr(loss, name).copy_(value)
+        stepper.restart()
+
+    def log(self, batch: TensorDictBase | None) -> dict[str, Any]:
+        """The number of fresh starts so far."""
+        return {"restarts": self.restarts, "log_pbar": False}
+
+    def state_dict(self) -> dict[str, int]:
+        """The number of fresh starts."""
+        return {"restarts": self.restarts}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self.restarts = int(state_dict["restarts"])
+
+    def register(self, trainer: Trainer, name: str = "restarts") -> None:
+        """Attaches the hook to ``pre_optim_steps`` and ``post_steps_log``."""
+        trainer.register_op("pre_optim_steps", self)
+        trainer.register_op("post_steps_log", self.log)
         trainer.register_module(name, self)
 
 

@@ -248,7 +248,7 @@ class LatentTraining:
         s, data = self.config.synthesis, self.latents
         g = torch.Generator().manual_seed(self.config.seed + 99_000 + number)
         z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
-        actions = self._action_grid(s.actions)
+        actions = _action_grid(self.action_scale, s.actions)
         _, axes = self._errors(z, g, s.teach_spread)
         successors = self._successors(z, actions)
         value = safety_values(successors, z, signed_margin(z, unsafe), residuals=axes)
@@ -424,7 +424,7 @@ class LatentTraining:
         """Signed distance to the robust invariant set; actions that keep the largest clearance, or lead back soonest."""
         s, data = self.config.synthesis, self.latents
         z, unsafe = data["latent"], data["region"][:, 0] == UNSAFE
-        zc, actions = z[~unsafe], self._action_grid(s.actions)
+        zc, actions = z[~unsafe], _action_grid(self.action_scale, s.actions)
         found = robust_invariant_set(self._successors(zc, actions), zc, z[unsafe], residuals=errors)
         kept = found.inside
         if not bool(kept.any()):
@@ -489,18 +489,6 @@ class LatentTraining:
             residual = data["next_latent"] - self.dynamics(z, data["action"])
         sample = torch.randperm(len(z), generator=generator)[:30000]
         return nearby_residuals(latent, z[sample], residual[sample], count=self.config.synthesis.residuals, spread=spread)
-
-    def _action_grid(self, per_dimension: int) -> Tensor:
-        """A regular grid of actions, coarser where many dimensions would make it too large."""
-        m = len(self.action_scale)
-        k = max(2, min(per_dimension, int(_MOST_ACTIONS ** (1 / m) + 1e-6)))
-        if k**m > 8 * _MOST_ACTIONS:
-            raise ConfigError(
-                f"expected at most {int(math.log2(8 * _MOST_ACTIONS))} action dimensions, received {m}: a grid of actions is "
-                "tried at every latent; set synthesis.enabled=false to keep what the joint training has found"
-            )
-        axes = [torch.linspace(-scale, scale, k) for scale in self.action_scale]
-        return torch.cartesian_prod(*axes).reshape(-1, m)
 
     @torch.no_grad()
     def _successors(self, latent: Tensor, actions: Tensor) -> Tensor:
@@ -590,6 +578,19 @@ class LatentTraining:
         self.generator.set_state(body["generator"])
         self.phase, self.step, self.seconds = body["phase"], body["step"], body["seconds"]
         self._loop_state = body["loop"]
+
+
+def _action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
+    """A regular grid of actions, coarser where many dimensions would make it too large."""
+    m = len(action_scale)
+    k = max(2, min(per_dimension, int(_MOST_ACTIONS ** (1 / m) + 1e-6)))
+    if k**m > 8 * _MOST_ACTIONS:
+        raise ConfigError(
+            f"expected at most {int(math.log2(8 * _MOST_ACTIONS))} action dimensions, received {m}: a grid of actions is "
+            "tried at every latent; set synthesis.enabled=false to keep what the joint training has found"
+        )
+    axes = [torch.linspace(-scale, scale, k) for scale in action_scale]
+    return torch.cartesian_prod(*axes).reshape(-1, m)
 
 
 def _same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:

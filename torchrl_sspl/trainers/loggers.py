@@ -52,6 +52,7 @@ METRICS: Mapping[str, str] = MappingProxyType(
         # The optimisation.
         "grad_norm": "norm of the gradient before clipping",
         "warm_start": "1 while the world model alone is trained",
+        "restarts": "fresh starts so far, because S and U were not told apart",
         "optim_steps": "optimiser steps so far",
         "lipschitz_share": "share of the last Lipschitz step that was kept",
         # Margins, estimated from the buffer.

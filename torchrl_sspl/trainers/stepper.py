@@ -101,6 +101,16 @@ class SSPLStepper(OptimizationStepper):
         self.warm_start_error = warm_start_error
         self.mislabelled = 2.0  # running mean of the two errors; both are 1 at worst
 
+    @property
+    def blind(self) -> bool:
+        """Whether S and U are yet to be told apart."""
+        return self.warm_start_error is not None and self.mislabelled > self.warm_start_error
+
+    def restart(self) -> None:
+        """Begins the warm start again, for fresh weights: counter and moments of the optimiser are forgotten."""
+        self.count, self.mislabelled = 0, 2.0
+        self.optimizer.state.clear()
+
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """One step on a batch of transitions.
 
@@ -111,7 +121,7 @@ class SSPLStepper(OptimizationStepper):
         Returns:
             Detached scalars.
         """
-        blind = self.warm_start_error is not None and self.mislabelled > self.warm_start_error
+        blind = self.blind
         warm = blind or self.count < self.warm_start_steps
         self.count += 1
         device = self.optimizer.param_groups[0]["params"][0].device.type
