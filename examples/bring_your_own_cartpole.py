@@ -22,6 +22,7 @@ class OnTheCart(gymnasium.Wrapper):  # the camera rides on the cart: pole and ra
 def make():
     cart = gymnasium.make("CartPole-v1", render_mode="rgb_array")
     cart.unwrapped.kinematics_integrator = "semi-implicit"  # a push shows in the next picture, not in the one after it
+    cart.unwrapped.tau = 0.01  # s; four steps to left or right make five pushes between full left and full right
     return OnTheCart(cart)
 
 
@@ -31,7 +32,7 @@ my_env = partial(
     safe=lambda state, info: abs(state[2]) < 0.03 and abs(state[3]) < 0.3,  # pole angle in rad, rate in rad/s
     unsafe=lambda state, info: abs(state[2]) > 0.15,
     reset_options={"low": -0.12, "high": 0.12},
-    action_repeat=2,  # 0.04 s between two pictures
+    action_repeat=4,  # 0.04 s between two pictures
     image_size=64,
     horizon=40,
 )

@@ -116,6 +116,17 @@ def test_discrete_actions_cut_the_interval_into_equal_parts(action, choice):
     assert env._envs[0].actions[-1] == choice
 
 
+@pytest.mark.parametrize(
+    ("action", "choices"),
+    [(-1.0, [5, 5]), (-0.7, [5, 5]), (-0.5, [6, 5]), (-0.3, [6, 5]), (0.0, [6, 6]), (0.3, [7, 6]), (0.9, [7, 7]), (2.0, [7, 7])],
+)
+def test_neighbouring_numbers_mix_where_actions_repeat(action, choices):
+    env = slider(1, make=lambda: Slider(spaces.Discrete(3, start=5)), action_repeat=2, settle=False)
+    env.reset()
+    env.step(TensorDict(action=torch.tensor([[action]]), batch_size=[1]))
+    assert env._envs[0].actions == choices
+
+
 def test_same_seed_gives_the_same_episodes_and_another_seed_others():
     store = [collect_random(slider(2), 40, seed=seed, steps=5).get(slice(None))["frames"] for seed in (3, 3, 4)]
     assert torch.equal(store[0], store[1])

@@ -138,6 +138,9 @@ def test_the_level_keeps_held_out_observations_of_U_outside():
     assert separating_level([episodes([-0.3, -0.1], [SAFE, UNSAFE])], 0.02) == pytest.approx(-0.12)
     assert separating_level([episodes([-0.3, -0.1], [SAFE, UNSAFE], [True, False])], 0.02) == 0.0
     assert separating_level([episodes([-0.3, -0.1], [SAFE, UNLABELLED])], 0.02) == 0.0
+    # With a reserve: to the middle between S and U, no lower than the reserve unless U asks for it, and not for nothing.
+    for safe, unsafe, level in ((-0.2, 0.1, -0.05), (-0.4, 0.1, -0.1), (-0.4, -0.2, -0.22), (0.1, 0.2, 0.0), (0.1, 0.01, -0.01)):
+        assert separating_level([episodes([safe, unsafe], [SAFE, UNSAFE])], 0.02, 0.1) == pytest.approx(level)
 
 
 def test_exploration_is_random_in_its_share_of_the_environments():

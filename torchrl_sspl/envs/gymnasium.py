@@ -40,7 +40,9 @@ class GymnasiumPixels(EnvBase):
 
     Actions lie in a box around zero. For a ``Box`` of gymnasium the action is the distance from its middle, in its
     own units: :math:`u_{gym} = (low + high) / 2 + u`. For ``Discrete(k)`` the interval [-1, 1] is cut into k equal
-    parts, in the order of gymnasium's numbers.
+    parts, in the order of gymnasium's numbers; with r repetitions into :math:`(k - 1) r + 1`, so that neighbouring numbers
+    mix: part j is the number :math:`\lfloor j / r \rfloor + 1` in the first :math:`j \bmod r` repetitions and
+    :math:`\lfloor j / r \rfloor` in the others.
 
     A reset is followed by one step with the action zero, so that the two first frames show motion. Where systems start
     at rest, ``settle=False`` leaves the step out, and the two first frames are the same.
@@ -53,8 +55,9 @@ class GymnasiumPixels(EnvBase):
         image_size: height and width of the frames, in pixels; pictures are averaged down to it.
         horizon: steps after which an episode is truncated; ``None`` leaves that to gymnasium.
         reset_options: ``options`` of gymnasium's reset, or ``(numpy generator) -> options``.
-        action_repeat: steps of gymnasium per step, all with the same action; the two frames of an observation, and what the
-            predicates judge, lie that far apart. Where a step moves less than the picture shows, it makes motion visible.
+        action_repeat: steps of gymnasium per step, all with the same action, of a discrete one with the mixture above; the two
+            frames of an observation, and what the predicates judge, lie that far apart. Where a step moves less than the
+            picture shows, it makes motion visible; of discrete actions it makes finer ones.
         settle: let one step pass after a reset.
         ignore_termination: let episodes go on where gymnasium ends them, up to ``horizon``: where it ends them in U, no
             transition would start there. The system has to bear it (those of gymnasium do, with a warning).
@@ -155,13 +158,15 @@ class GymnasiumPixels(EnvBase):
         scale = self._scale.tolist()
         return scale[0] if len(set(scale)) == 1 else scale
 
-    def _native_action(self, action: np.ndarray) -> Any:
-        """Action of gymnasium for an action ``(action_dim,)``; beyond the bounds it is clamped to them."""
+    def _native_actions(self, action: np.ndarray) -> list[Any]:
+        """Actions of gymnasium, one for each repetition, for an action ``(action_dim,)``; clamped to the bounds."""
         bounded = np.clip(action, -self._scale, self._scale)
+        repeat = self.action_repeat
         if self._choices is not None:
-            part = int((float(bounded[0]) + 1.0) / 2.0 * self._choices)
-            return self._start + min(part, self._choices - 1)
-        return (self._middle + bounded).reshape(self._action_shape).astype(self._action_dtype)
+            parts = (self._choices - 1) * repeat + 1
+            lower, more = divmod(min(int((float(bounded[0]) + 1.0) / 2.0 * parts), parts - 1), repeat)
+            return [self._start + lower + (step < more) for step in range(repeat)]
+        return [(self._middle + bounded).reshape(self._action_shape).astype(self._action_dtype)] * repeat
 
     def _make_specs(self) -> None:
         shape, device, size = self.batch_size, self.device, self.image_size
@@ -205,9 +210,9 @@ class GymnasiumPixels(EnvBase):
         return SAFE if safe else UNSAFE if unsafe else UNLABELLED
 
     def _advance(self, env: Any, action: np.ndarray) -> tuple[Any, float, bool, bool, Mapping[str, Any]]:
-        """``action_repeat`` steps of gymnasium with the same action; rewards add up, the end of an episode ends them too."""
-        native, total = self._native_action(action), 0.0
-        for _ in range(self.action_repeat):
+        """``action_repeat`` steps of gymnasium; rewards add up, the end of an episode ends them too."""
+        total = 0.0
+        for native in self._native_actions(action):
             observation, reward, terminated, truncated, info = env.step(native)
             total += float(reward)
             terminated = bool(terminated) and not self.ignore_termination

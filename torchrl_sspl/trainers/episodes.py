@@ -116,21 +116,28 @@ def random_actions(env: EnvBase, seed: int) -> Act:
 
 
 @torch.no_grad()
-def separating_level(episodes: Sequence[Episodes], guard: float) -> float:
-    r"""Level c for which :math:`\{B \le c\}` is large, holds no labelled unsafe observation and all safe ones.
+def separating_level(episodes: Sequence[Episodes], guard: float, reserve: float = 0.0) -> float:
+    r"""Level c for which :math:`\{B \le c\}` holds no labelled unsafe observation, and keeps away from others like these.
+
+    .. math:: c = \min\bigl(0,\; u - g,\; \max(-r, \tfrac{s + u}{2})\bigr), \qquad u = \min_U B, \quad s = \max_S B
 
     Args:
         episodes: held-out episodes.
-        guard: distance that observations of U keep from the level.
+        guard: g, distance that observations of U keep from the level.
+        reserve: r, what one step from :math:`\{B \le 0\}` leaves below zero, so that levels down to -r are kept as
+            zero is. Within it the level is lowered to the middle between U and S, where that leaves all of S inside.
 
     Returns:
-        :math:`c = \min(0, \min_U B - g)` where observations of U lie lower than the guard; else zero: a level is
-        lowered, never raised.
+        The level: lowered, never raised; zero where no observation of U was seen.
 
     Source: none.
     """
-    unsafe = torch.cat([e.barrier[(e.region == UNSAFE) & e.alive] for e in episodes])
-    return min(0.0, float(unsafe.min()) - guard) if len(unsafe) else 0.0
+    unsafe, safe = (torch.cat([e.barrier[(e.region == code) & e.alive] for e in episodes]) for code in (UNSAFE, SAFE))
+    if not len(unsafe):
+        return 0.0
+    nearest = float(unsafe.min())
+    between = (nearest + float(safe.max())) / 2 if len(safe) else 0.0
+    return min(0.0, nearest - guard, max(-reserve, between))
 
 
 def evaluate_episodes(agent: Agent, make_env: MakeEnv, config: EpisodesConfig | None = None) -> Evaluation:

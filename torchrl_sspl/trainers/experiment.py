@@ -425,7 +425,7 @@ class Experiment:
             ]
         finally:
             env.close()
-        level = separating_level(held_out, e.guard)
+        level = separating_level(held_out, e.guard, self.config.synthesis.margin if self.synthesis_dir else 0.0)
         if level < 0.0 and not bool((held_out[0].barrier[0] <= level).any()):
             self.warnings.append(
                 f"no held-out reset lies in the set: its level was lowered to {level:.3g} to leave out every held-out observation "

@@ -15,7 +15,7 @@ from torchrl_sspl.trainers.config import LatentConfig, NetworkConfig, _assign
 
 SCHEDULES = ("cosine", "constant")
 BACKENDS = ("sync", "process", "ray")
-_RANDOM_FRAMES = 6400
+_RANDOM_FRAMES = 12_800
 AUTOCAST = ("none", "bfloat16", "float16")
 
 
@@ -145,7 +145,7 @@ class CollectorConfig:
         envs: environments per collector, stepped together.
         frames_per_batch: transitions per batch, over all collectors.
         init_random_frames: transitions under random actions before learning starts; "none" is half of
-            trainer.total_frames, 6400 at most.
+            trainer.total_frames, 12800 at most.
         max_frames_per_traj: steps after which an episode is cut, so that many start; "none" leaves that to the environment.
         exploration: standard deviation of the noise on the policy's actions, as a share of the largest action.
         random_share: share of the environments that act at random all the time.
@@ -155,7 +155,7 @@ class CollectorConfig:
     backend: str = "sync"
     workers: int = 1
     envs: int = 16
-    frames_per_batch: int = 640
+    frames_per_batch: int = 1280
     init_random_frames: int | None = None
     max_frames_per_traj: int | None = 10
     exploration: float = 0.1
@@ -231,8 +231,8 @@ class TrainerConfig:
         warm_start_steps: of these, the first on the world model alone.
         warm_start_error: share of S and U on the wrong side of the barrier, summed, down to which the world model alone goes
             on being trained; "none" goes by the steps alone.
-        restarts: fresh starts with other initial weights, at most, where the warm start is over and S and U are not told apart
-            (by warm_start_error); 0 for none.
+        restarts: fresh starts with other initial weights, at most, where after warm_start_steps that share exceeds
+            warm_start_error and no longer falls; 0 for none.
         clip_norm: bound on the norm of the gradient.
         checkpoint_every: transitions between checkpoints; negative for none.
         keep_checkpoints: checkpoints that are kept.
@@ -242,13 +242,13 @@ class TrainerConfig:
         progress: show a progress bar.
     """
 
-    total_frames: int = 12_800
+    total_frames: int = 25_600
     optim_steps_per_batch: int = 400
     warm_start_steps: int = 1200
     warm_start_error: float | None = 0.05
     restarts: int = 2
     clip_norm: float = 5.0
-    checkpoint_every: int = 6400
+    checkpoint_every: int = 12_800
     keep_checkpoints: int = 2
     evaluate_every: int = 0
     autocast: str = "none"

@@ -169,13 +169,14 @@ class RestartHook(TrainerHookBase):
     """Begins again with fresh weights where the warm start does not tell S from U.
 
     Joint training of encoder and barrier has poor local optima: latents that predict well and leave out what S and U differ
-    in. No number of further steps leads out of them; other initial weights mostly do. Before the steps of every collected
-    batch, the hook looks at the stepper; the data are kept, the steps are gone.
+    in. No number of further steps leads out of them; other initial weights mostly do. The hook looks at the stepper before
+    the steps of every collected batch, and begins again if the share on the wrong side of the barrier is no longer falling
+    (by a fifth since the last look). The data are kept, the steps are gone.
 
     Args:
         trainer: the trainer; its stepper has a ``warm_start_error``.
         fresh: ``attempt -> loss`` like the trainer's, with other initial weights; attempts count from 1.
-        after: optimiser steps since the last start, after which S and U have to be told apart.
+        after: optimiser steps since the last start before which it never happens.
         most: fresh starts at most.
 
     Raises:
@@ -185,19 +186,21 @@ class RestartHook(TrainerHookBase):
 
     Example:
         >>> RestartHook(None, lambda attempt: None, after=1200, most=2).state_dict()
-        {'restarts': 0}
+        {'restarts': 0, 'last': 2.0}
     """
 
     def __init__(self, trainer: Any, fresh: Callable[[int], SSPLLoss], *, after: int, most: int) -> None:
         if after < 1 or most < 1:
             raise ConfigError(f"expected after >= 1 steps and most >= 1 restarts, received {after} and {most}")
-        self.trainer, self.fresh, self.after, self.most, self.restarts = trainer, fresh, after, most, 0
+        self.trainer, self.fresh, self.after, self.most = trainer, fresh, after, most
+        self.restarts, self.last = 0, 2.0
 
     @torch.no_grad()
     def __call__(self) -> None:
         """Looks, and begins again if need be."""
         stepper = self.trainer.optimization_stepper
-        if not stepper.blind or stepper.count < self.after or self.restarts == self.most:
+        falling, self.last = stepper.mislabelled < 0.8 * self.last, stepper.mislabelled
+        if not stepper.blind or falling or stepper.count < self.after or self.restarts == self.most:
             return
         self.restarts += 1
         loss = self.trainer.loss_module
@@ -211,13 +214,13 @@ class RestartHook(TrainerHookBase):
         """The number of fresh starts so far."""
         return {"restarts": self.restarts, "log_pbar": False}
 
-    def state_dict(self) -> dict[str, int]:
-        """The number of fresh starts."""
-        return {"restarts": self.restarts}
+    def state_dict(self) -> dict[str, float]:
+        """The number of fresh starts, and what was seen at the last look."""
+        return {"restarts": self.restarts, "last": self.last}
 
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
         """Restores what ``state_dict`` returned."""
-        self.restarts = int(state_dict["restarts"])
+        self.restarts, self.last = int(state_dict["restarts"]), float(state_dict["last"])
 
     def register(self, trainer: Trainer, name: str = "restarts") -> None:
         """Attaches the hook to ``pre_optim_steps`` and ``post_steps_log``."""
