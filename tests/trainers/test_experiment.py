@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -20,7 +21,9 @@ from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 from torchrl_sspl.trainers.episodes import Episodes, evaluate_episodes, run_episodes, separating_level
 from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy
 from torchrl_sspl.trainers.experiment_config import EpisodesConfig, experiment_config
+from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.latents import LatentTraining
+from torchrl_sspl.trainers.stepper import SSPLStepper
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 
@@ -228,6 +231,38 @@ def test_without_success_it_starts_again_with_other_weights_and_says_so(tmp_path
     assert not any("did not tell S from U" in text for text in content.warnings)
     # A barrier that never learnt leaves no set: the level that excludes U excludes every reset, and this is said too.
     assert any("no held-out reset lies in the set" in text for text in content.warnings)
+
+
+def test_a_start_that_still_improves_is_not_given_up():
+    class Loss(nn.Module):
+        def __init__(self, value: float) -> None:
+            super().__init__()
+            self.weight = nn.Parameter(torch.tensor(value))
+            self.register_buffer("safety_margin", torch.tensor(value))
+            self.register_buffer("dynamics_margin", torch.tensor(value))
+
+    stepper = SSPLStepper(torch.optim.Adam([nn.Parameter(torch.zeros(1))]), warm_start_error=0.05)
+    trainer = SimpleNamespace(optimization_stepper=stepper, loss_module=Loss(0.0))
+    hook = RestartHook(trainer, lambda attempt: Loss(float(attempt)), after=100, most=2)
+    for count, mislabelled, restarts in (
+        (0, 2.0, 0),  # nothing was done yet
+        (50, 1.9, 0),  # no better, but early
+        (100, 0.9, 0),  # better
+        (150, 0.5, 0),
+        (200, 0.45, 1),  # no longer
+        (100, 0.5, 2),  # the second start no better than the first one was
+        (100, 0.5, 2),  # twice is all
+    ):
+        stepper.count, stepper.mislabelled = count, mislabelled
+        hook()
+        assert hook.restarts == restarts
+    stepper.count, stepper.mislabelled, hook.restarts = 200, 0.04, 0
+    hook()
+    assert hook.restarts == 0  # told apart
+    assert trainer.loss_module.weight.item() == 2.0
+    assert trainer.loss_module.safety_margin.item() == trainer.loss_module.dynamics_margin.item() == 0.0
+    with pytest.raises(ConfigError, match="after >= 1"):
+        RestartHook(trainer, lambda attempt: None, after=0, most=1)
 
 
 def test_what_follows_the_joint_training_starts_anew_on_other_latents(tmp_path):
