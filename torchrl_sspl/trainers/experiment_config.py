@@ -64,7 +64,7 @@ class GymnasiumEnvConfig:
         unsafe: "package.module:function" of (observation, info), true in U.
         image_size: height and width of the frames, in pixels.
         horizon: steps after which an episode is truncated.
-        action_repeat: steps of gymnasium per step, all with the same action.
+        action_repeat: steps of gymnasium per step, all with the same action, of a discrete one with a mixture of neighbours.
         ignore_termination: let episodes go on where gymnasium ends them, up to the horizon.
     """
 
