@@ -179,14 +179,14 @@ def _measure(
     def draw(n: int, keep: Callable[[Tensor], Tensor]) -> tuple[Tensor, Tensor]:
         """Uniform states for whose latents a condition holds, and these latents."""
         states, latents, count = [], [], 0
-        for _ in range(60):
+        for tried in range(1, 61):
             state = env.sample_states(2 * n, generator, region=env.state_space)
             latent = encode_states(agent, env, state)
             kept = keep(latent)
             states.append(state[kept])
             latents.append(latent[kept])
             count += int(kept.sum())
-            if count >= n:
+            if count >= n or (tried == 10 and count == 0):  # of 20 n states none: the set is as good as empty
                 break
         return torch.cat(states)[:n], torch.cat(latents)[:n]
 
