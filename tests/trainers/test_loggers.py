@@ -13,6 +13,7 @@ from torchrl.record.loggers.csv import CSVLogger
 
 from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, ShapeError
 from torchrl_sspl.trainers import loggers
+from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.loggers import METRICS, close_logger, log_figure, log_scalars, log_video, make_logger
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
@@ -149,6 +150,7 @@ def test_documented_names_are_the_names_of_the_library():
 
 def emitted(folder: Path, **options) -> set[str]:
     trainer = build(batches=2, logger=CSVLogger("run", log_dir=str(folder)), log_interval=0, **options)
+    RestartHook(trainer, lambda attempt: trainer.loss_module, after=10**6, most=1).register(trainer)
     trainer.train()
     return {path.stem for path in (folder / "run" / "scalars").glob("*.csv")}
 
