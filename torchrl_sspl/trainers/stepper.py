@@ -107,9 +107,11 @@ class SSPLStepper(OptimizationStepper):
         return self.warm_start_error is not None and self.mislabelled > self.warm_start_error
 
     def restart(self) -> None:
-        """Begins the warm start again, for fresh weights: counter and moments of the optimiser are forgotten."""
+        """Begins the warm start again, for fresh weights: counter and moments of the optimisers are forgotten."""
         self.count, self.mislabelled = 0, 2.0
-        self.optimizer.state.clear()
+        for optimizer in (self.optimizer, self.lipschitz_optimizer):
+            if optimizer is not None:
+                optimizer.state.clear()
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """One step on a batch of transitions.
