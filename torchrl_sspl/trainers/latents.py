@@ -195,7 +195,7 @@ class LatentTraining:
             self._bar.update()
             if self.step % 100 == 0 or self.step == steps:
                 row = {k: float(v.detach()) for k, v in terms.items()}
-                if not all(map(_finite, row.values())):
+                if not all(map(math.isfinite, row.values())):
                     raise ConfigError(
                         f"expected finite losses, received {row} in step {self.step}; lower the learning rate, or resume "
                         "from the last checkpoint with another seed"
@@ -595,7 +595,3 @@ def _action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
 
 def _same(one: dict[str, Tensor], other: dict[str, Tensor]) -> bool:
     return one.keys() == other.keys() and all(torch.equal(value, other[key]) for key, value in one.items())
-
-
-def _finite(value: float) -> bool:
-    return value == value and abs(value) != float("inf")
