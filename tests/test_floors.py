@@ -14,7 +14,7 @@ import torchrl_sspl
 PACKAGE = Path(torchrl_sspl.__file__).parent  # the checkout's, or that of an installed wheel
 ROOT = PACKAGE.parent
 FLOORS = {
-    "errors": 0, "sets": 0, "functional": 0,
+    "errors": 0, "devices": 0, "sets": 0, "functional": 0,
     "lipschitz": 1,
     "modules": 2, "envs": 2, "certification": 2,
     "objectives": 3, "data": 3, "safety": 3,

@@ -1,25 +1,47 @@
-"""On a GPU: the same numbers as on the CPU, training with all options, environments and evaluation on the device."""
+"""On a GPU: the same numbers as on the CPU, training with all options, environments and evaluation on the device.
+
+Without a GPU ``test_simulated_cuda.py`` runs these on a simulated one.
+"""
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 
 import pytest
 import torch
+from conformance.cases import CASES, Case
 from tensordict import TensorDict
 from tiny import TINY as SMOKE
 from tiny import TINY_EXPERIMENT
+from torchrl.collectors import Collector
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.objectives import SoftUpdate
 
+from torchrl_sspl import certify, load
+from torchrl_sspl.certification import Budget
 from torchrl_sspl.data import TransitionStore, collect_random
-from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.lipschitz import SandwichBarrier
-from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy
+from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.lipschitz import (
+    LMIBarrier,
+    SandwichBarrier,
+    lipschitz_lower,
+    lipschitz_upper,
+    prove_lipschitz,
+    solve_multipliers,
+)
+from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy, SaLaD, make_rollout_policy
+from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.objectives import SSPLLoss
-from torchrl_sspl.trainers.config import make_config
+from torchrl_sspl.trainers import certify_on_episodes, evaluate, rollout
+from torchrl_sspl.trainers.config import EvaluationConfig, make_config
 from torchrl_sspl.trainers.episodes import evaluate_episodes
+from torchrl_sspl.trainers.evaluation import encode_states
 from torchrl_sspl.trainers.experiment import Experiment
 from torchrl_sspl.trainers.experiment_config import EnvFactory, EpisodesConfig, experiment_config
+from torchrl_sspl.trainers.paper import PaperTraining
 from torchrl_sspl.trainers.pipeline import SafePolicyTraining
+from torchrl_sspl.trainers.quadruped import latency
 
 pytestmark = [
     pytest.mark.gpu,
@@ -68,6 +90,36 @@ def test_loss_and_gradients_are_those_of_the_cpu():
             torch.testing.assert_close(one.grad, other.grad.cpu(), rtol=1e-2, atol=1e-3)
 
 
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name)
+def test_every_loss_stays_on_the_gpu(case: Case):
+    loss = case.build().cuda()
+    terms = loss(case.data().cuda())
+    assert all(value.is_cuda and value.isfinite().all() for value in terms.values())
+    total(terms).backward()
+    assert all(p.grad.is_cuda for p in loss.parameters() if p.grad is not None)
+
+
+def test_loss_trains_in_a_loop_of_ones_own():
+    env = PendulumEnv(batch_size=[16], image_size=32, horizon=5, device="cuda")
+    salad = SaLaD.from_sizes(latent_dim=3, action_dim=1, action_scale=env.max_action)
+    policy = Policy(latent_dim=3, action_dim=1, action_scale=env.max_action)
+    loss = SSPLLoss(*salad, policy, successor="target").cuda()
+    updater, optimizer = SoftUpdate(loss, tau=0.05), torch.optim.Adam(loss.parameters(), 1e-3)
+    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(512, device="cuda"), batch_size=32)
+    frames = {"frames_per_batch": 160, "total_frames": 320, "auto_register_policy_transforms": False}
+    before = copy.deepcopy(loss.state_dict())
+    for data in Collector(env, make_rollout_policy(salad, policy).cuda(), **frames):
+        buffer.extend(data.reshape(-1))
+        optimizer.zero_grad()
+        total(loss(buffer.sample())).backward()
+        optimizer.step()
+        updater.step()
+    after = loss.state_dict()
+    moved = [key for key, value in before.items() if not torch.equal(value, after[key])]
+    assert any("target" in key for key in moved)
+    assert any("target" not in key for key in moved)
+
+
 def test_compiled_loss_is_the_eager_one():
     loss, data = make_loss().cuda(), make_batch().cuda()
     compiled = torch.compile(loss, fullgraph=True)(data)
@@ -92,10 +144,40 @@ def test_experiments_train_on_the_gpu_and_return_an_agent_on_the_cpu(options, tm
     assert outcome.evaluation["starts_inside"] is not None
 
 
-def test_rounds_warm_up_on_the_gpu(tmp_path):
+def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(tmp_path):
+    def experiment(name: str) -> Experiment:
+        options = ["trainer.checkpoint_every=256", "device=cuda", f"out_dir={tmp_path / name}"]
+        return Experiment(experiment_config([*TINY, *options]))
+
+    class Interrupted(Exception): ...
+
+    whole = experiment("whole")
+    whole.train()
+    broken = experiment("broken")
+    updates, batches = broken.trainer.optim_steps, []
+
+    def interrupt(batch: TensorDict) -> None:
+        batches.append(batch)
+        if len(batches) == 2:
+            raise Interrupted
+        updates(batch)
+
+    broken.trainer.optim_steps = interrupt
+    with pytest.raises(Interrupted):
+        broken.train()
+    resumed = experiment("broken")
+    resumed.train(resume=True)
+    found = resumed.loss.state_dict()
+    for key, value in whole.loss.state_dict().items():
+        if isinstance(value, torch.Tensor):
+            torch.testing.assert_close(value, found[key], msg=key)
+
+
+@pytest.mark.parametrize("kind", [SafePolicyTraining, PaperTraining])
+def test_rounds_learn_from_pixels_on_the_gpu(kind, tmp_path):
     devices = []
 
-    class Watched(SafePolicyTraining):
+    class Watched(kind):
         def _mixed_batch(self, stores):
             batch = super()._mixed_batch(stores)
             devices.append(batch["frames"].device.type)
@@ -105,6 +187,13 @@ def test_rounds_warm_up_on_the_gpu(tmp_path):
     result = Watched(config, lambda n, seed: PendulumEnv(batch_size=n, seed=seed)).run()
     assert set(devices) == {"cuda"}
     assert all(not p.is_cuda for p in result.agent.parameters())
+
+
+def test_moment_encoder_is_fitted_on_the_gpu(tmp_path):
+    options = ["network.encoder=MomentEncoder", "network.latent_dim=4", "device=cuda", f"out_dir={tmp_path}"]
+    config = make_config([*SMOKE, *options])
+    training = SafePolicyTraining(config, lambda n, seed: DubinsEnv(batch_size=n, seed=seed, image_size=64))
+    assert all(not p.is_cuda for p in training.run().agent.parameters())
 
 
 def test_environment_on_the_gpu_draws_what_it_draws_on_the_cpu():
@@ -129,3 +218,61 @@ def test_agents_are_evaluated_on_the_gpu(tmp_path):
     here = evaluate_episodes(agent, EnvFactory(config.env), sizes)
     there = evaluate_episodes(agent.cuda(), EnvFactory(config.env), sizes)
     assert abs(here["on_policy_error_mean"] - there["on_policy_error_mean"]) < 1e-2
+
+
+@pytest.fixture(scope="module")
+def pair() -> tuple[Agent, Agent]:
+    """A shipped agent on the CPU and on the GPU."""
+    return load("pendulum"), load("pendulum", "cuda")
+
+
+def test_measurements_on_the_true_system_are_those_of_the_cpu(pair):
+    env = PendulumEnv(batch_size=[1])
+    states = env.sample_states(100, torch.Generator().manual_seed(0))
+    torch.testing.assert_close(*(encode_states(agent, env, states) for agent in pair), rtol=1e-3, atol=1e-3)
+    here, there = (rollout(agent, env, states, 3) for agent in pair)
+    for field in dataclasses.fields(here):
+        torch.testing.assert_close(getattr(here, field.name), getattr(there, field.name), rtol=1e-2, atol=1e-2)
+    found = evaluate(pair[1], env, EvaluationConfig(grid=11, kernel_grid=31, rollouts=10, horizon=3))
+    assert found["volume_over_kernel"] > 0
+    assert pair[1].barrier[0].weight.is_cuda, "the caller's agent is left where it is"
+
+
+def test_quadrupeds_agent_answers_from_the_gpu():
+    agent, env = load("quadruped", "cuda"), DubinsEnv(batch_size=[1])
+    assert latency(agent, env, frames=20).value > 0
+    assert encode_states(agent, env, env.sample_states(3)).device.type == "cpu"
+
+
+def test_certificates_say_the_same_of_an_agent_on_the_gpu(pair):
+    options = {"level": 0.0, "horizon": 5, "budget": Budget(seconds=60.0)}
+    known = [certify(agent, PendulumEnv(batch_size=[1]), episodes=20, **options) for agent in pair]
+    resets = [certify_on_episodes(agent, PendulumEnv, episodes=20, envs=10, **options) for agent in pair]
+    for here, there in (known, resets):
+        assert here.weights == there.weights
+        assert here.layers["deterministic"].holds
+        assert there.layers["deterministic"].holds
+        for name, layer in here.layers.items():
+            assert [(s.name, s.holds) for s in layer.statements] == [(s.name, s.holds) for s in there.layers[name].statements]
+
+
+@pytest.mark.parametrize("kind", [SandwichBarrier, LMIBarrier])
+def test_lipschitz_constants_of_networks_on_the_gpu(kind):
+    torch.manual_seed(0)
+    here = kind(3, (8, 8))
+    there = copy.deepcopy(here).cuda()
+    plain = there.collapse() if kind is SandwichBarrier else there
+    upper = lipschitz_upper(plain)
+    assert upper == pytest.approx(lipschitz_upper(here.collapse() if kind is SandwichBarrier else here), rel=1e-4)
+    assert 0 < lipschitz_lower(plain, -1.0, 1.0, n=1000, generator=torch.Generator().manual_seed(0)) <= upper
+    multipliers = solve_multipliers(there, lipschitz_bound=there.lipschitz_bound)
+    assert prove_lipschitz(plain, 1.001 * there.lipschitz_bound, multipliers=multipliers).proved
+
+
+def test_figures_and_films_of_an_agent_on_the_gpu(pair, tmp_path):
+    viz = pytest.importorskip("torchrl_sspl.viz")
+    pytest.importorskip("matplotlib")
+    env, agent = PendulumEnv(batch_size=[1]), pair[1]
+    assert viz.animate(agent, env, torch.tensor([0.1, 0.0]), 3, tmp_path / "film.gif").is_file()
+    latent = agent.encode(env.observe(env.sample_states(50)).cuda())
+    assert viz.latent_space(latent, torch.arange(50, device="cuda") % 3, agent.barrier) is not None

@@ -126,7 +126,7 @@ def closed_loop(
         >>> system.step(torch.ones(1, 2)).tolist()
         [[0.5, 0.5]]
     """
-    corners = [torch.as_tensor(c, dtype=torch.float64).expand(latent_dim).clone() for c in (low, high)]
+    corners = [torch.as_tensor(c, dtype=torch.float64).cpu().expand(latent_dim).clone() for c in (low, high)]
     if not bool((corners[0] < corners[1]).all()):
         raise ConfigError(f"expected low < high in every dimension, received {corners[0].tolist()}, {corners[1].tolist()}")
     if not lipschitz_bound > 0:

@@ -13,6 +13,7 @@ from torch import Tensor
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
 from torchrl_sspl.sets import UNSAFE, Region, check_disjoint, label
 
@@ -106,7 +107,7 @@ class SafetyEnv(EnvBase):
         if horizon is not None and (not isinstance(horizon, int) or horizon < 1):
             raise ConfigError(f"horizon: expected an integer >= 1 or None, received {horizon!r}.")
         check_positive(max_action=max_action)
-        super().__init__(device=torch.device(device or "cpu"), batch_size=batch_size)
+        super().__init__(device=usable_device(device or "cpu"), batch_size=batch_size)
         self.state_dim, self.action_dim, self.max_action = state_dim, action_dim, float(max_action)
         self.safe_set, self.unsafe_set, self.state_space = safe_set, unsafe_set, state_space
         check_disjoint(safe_set, unsafe_set)

@@ -14,6 +14,7 @@ from torch.nn import functional as F
 from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import ConfigError, OverlapError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
@@ -110,7 +111,7 @@ class GymnasiumPixels(EnvBase):
             raise ConfigError("horizon: expected an integer >= 1 with ignore_termination, received None.")
         if not isinstance(image_size, int) or image_size < 8:
             raise ConfigError(f"image_size: expected an integer >= 8, received {image_size!r}.")
-        super().__init__(device=torch.device(device or "cpu"), batch_size=size)
+        super().__init__(device=usable_device(device or "cpu"), batch_size=size)
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.image_size, self.horizon = image_size, horizon
         self.reset_options, self.settle, self.ignore_termination = reset_options, settle, ignore_termination

@@ -8,6 +8,7 @@ import os
 import torch
 from torch import Tensor
 
+from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, NonFiniteError
 
 # The scene of gymnasium's Pendulum-v1, in pixels of its 500 x 500 screen, before the final vertical flip.
@@ -65,7 +66,7 @@ class PendulumRenderer:
         scale = image_size / _SCREEN
         first = math.floor((_CENTRE - _ROD - _CAP_RADIUS - 1) * scale) - 1
         self._window = slice(max(first, 0), image_size - max(first, 0))
-        x = torch.arange(self._window.start, self._window.stop, device=device) + 0.5
+        x = torch.arange(self._window.start, self._window.stop, device=usable_device(device or "cpu")) + 0.5
         self._x, self._y = x, image_size - x  # the screen is flipped at the end, so rows count from below
         self._scale = scale
         # The cap at the pivot and the axle never move: their coverage is supersampled once.

@@ -59,7 +59,7 @@ def lipschitz_lower(
     A third of the samples is uniform, the others lie around the steepest found so far.
 
     Args:
-        function: ``(m, p) -> (m, 1)``, differentiable almost everywhere.
+        function: ``(m, p) -> (m, 1)``, differentiable almost everywhere; a module may lie on any device.
         low: lower corner of the box, number or ``(p,)``.
         high: upper corner.
         n: number of gradients in each of three passes.
@@ -86,12 +86,13 @@ def lipschitz_lower(
         raise ConfigError("expected dim, the size of the input, for a function without linear layers; pass dim=")
     device = low.device if generator is None else generator.device
     low, high = low.to(device), high.to(device)
+    weight = next(function.parameters(), low) if isinstance(function, nn.Module) else low
     x = low + (high - low) * torch.rand(n, dim, generator=generator, device=device)
     best = 0.0
     with torch.enable_grad():
         for _ in range(3):
             x = x.detach().requires_grad_()
-            norm = torch.autograd.grad(function(x).sum(), x)[0].norm(dim=-1)
+            norm = torch.autograd.grad(function(x.to(weight.device)).sum(), x)[0].norm(dim=-1)
             best = max(best, float(norm.max()))
             # A piecewise linear function: a look around the steepest pieces beats more samples everywhere.
             steepest = x.detach()[norm.topk(max(1, n // 20)).indices]

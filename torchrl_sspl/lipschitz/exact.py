@@ -107,7 +107,7 @@ def prove_lipschitz(
     if not all(np.isfinite(v).all() and (v > 0).all() for v in lams):
         return outcome(-math.inf, "the multipliers are not all positive and finite")
 
-    exact, shift = _scaled(*_exact_lmi([w.cpu().double().numpy() for w in weights], lams, lipschitz_bound, *slope))
+    exact, shift = _scaled(*_exact_lmi([w.double().numpy() for w in weights], lams, lipschitz_bound, *slope))
     approximate = np.array([[v / 2**shift for v in row] for row in exact.tolist()], dtype=np.float64)
     lowest = float(np.linalg.eigvalsh(approximate)[0])
     try:

@@ -212,7 +212,7 @@ def solve_multipliers(
     slope = slope_interval(network, slope)
     weights = [w.double() for w in layer_weights(network)]
     if lipschitz_bound is not None and callable(getattr(network, "multipliers", None)):
-        own = [m.detach().double() for m in network.multipliers()]  # type: ignore[union-attr, operator]
+        own = [m.detach().cpu().double() for m in network.multipliers()]  # type: ignore[union-attr, operator]
         if not int(torch.linalg.cholesky_ex(lmi_matrix(weights, own, lipschitz_bound, slope)).info):
             return own
     if len(weights) == 1:

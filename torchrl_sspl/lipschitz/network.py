@@ -83,7 +83,7 @@ def layer_weights(network: nn.Module | Sequence[Tensor]) -> list[Tensor]:
         network: plain network (see :func:`plain_layers`), or the weights themselves.
 
     Returns:
-        One ``(out, in)`` matrix per linear layer, detached.
+        One ``(out, in)`` matrix per linear layer, detached, in host memory, where bounds are computed.
 
     Raises:
         ConfigError: if the module is no plain network.
@@ -97,9 +97,9 @@ def layer_weights(network: nn.Module | Sequence[Tensor]) -> list[Tensor]:
         [(8, 2), (1, 8)]
     """
     if isinstance(network, nn.Module):
-        weights = [layer.weight.detach() for layer in plain_layers(network)[0]]
+        weights = [layer.weight.detach().cpu() for layer in plain_layers(network)[0]]
     else:
-        weights = [w.detach() for w in network]
+        weights = [w.detach().cpu() for w in network]
     if not weights or any(w.ndim != 2 for w in weights):
         raise ShapeError(
             f"expected at least one matrix, received shapes {[tuple(w.shape) for w in weights]}; pass a network or its weights"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +13,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
@@ -159,8 +162,9 @@ class Agent(nn.Module):
 
         Raises:
             CheckpointError: if a file is missing, unreadable, of another format, or does not fit the networks.
+            ConfigError: if this machine has no such device.
         """
-        path = Path(path)
+        path, device = Path(path), usable_device(device)
         for name in (DESCRIPTION_FILE, WEIGHTS_FILE):
             if not (path / name).is_file():
                 raise CheckpointError(
@@ -200,6 +204,36 @@ class Agent(nn.Module):
         return agent.to(device)
 
 
+class _Elsewhere(nn.Module):
+    """An encoder that stays on its device, for callers whose tensors lie in host memory."""
+
+    def __init__(self, encoder: nn.Module, device: torch.device) -> None:
+        super().__init__()
+        self.encoder, self.device = encoder, device
+        for name in ("frames", "head"):  # the halves of a frame encoder
+            if hasattr(encoder, name):
+                setattr(self, name, self._moved(getattr(encoder, name)))
+
+    def _moved(self, function: Callable[..., Tensor]) -> Callable[..., Tensor]:
+        return lambda *tensors: function(*(t.to(self.device) for t in tensors)).cpu()
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return self.encoder(pixels.to(self.device)).cpu()
+
+
+def hosted(agent: Agent) -> Agent:
+    """The agent for measurements, which draw states and count in host memory.
+
+    The encoder, in which the time goes, stays on its device and takes and gives tensors of the host; the small networks
+    are copied to the host. An agent that is there already is returned as it is.
+    """
+    device = next(agent.barrier.parameters()).device
+    if device.type == "cpu":
+        return agent
+    dynamics, barrier, policy = (copy.deepcopy(net).cpu() for net in (agent.dynamics, agent.barrier, agent.policy))
+    return Agent(_Elsewhere(agent.encoder, device), dynamics, barrier, policy, agent.lipschitz_bound, agent.description)
+
+
 def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any]) -> nn.Module:
     name = spec["class"]
     if name not in registry:
@@ -222,6 +256,7 @@ def load(name_or_path: str | Path, device: torch.device | str = "cpu") -> Agent:
 
     Raises:
         CheckpointError: if there is no such agent, or it cannot be read.
+        ConfigError: if this machine has no such device.
 
     Source: none.
     """

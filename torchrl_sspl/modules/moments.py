@@ -133,8 +133,9 @@ class MomentEncoder(FrameEncoder):
     def fit(self, frames: Tensor) -> None:
         """Take background and whitening from frames, uint8 ``(n, 3, H, W)`` of different moments."""
         self._check(frames, self.in_channels, "frames")
-        pooled = torch.cat([F.adaptive_avg_pool2d(part.float(), self.pool_to) for part in frames.split(500)])
-        self.trunk[0].fit(pooled / 127.5 - 1.0)  # type: ignore[operator]
+        device = self.gain.device
+        pooled = [F.adaptive_avg_pool2d(part.to(device).float(), self.pool_to) for part in frames.split(500)]
+        self.trunk[0].fit(torch.cat(pooled) / 127.5 - 1.0)  # type: ignore[operator]
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
         """Latent from the centres of two successive frames; see :meth:`FrameEncoder.head`."""

@@ -31,7 +31,7 @@ from torchrl_sspl.certification.layers import (
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CertificationError, ConfigError
 from torchrl_sspl.functional import covering_radius
-from torchrl_sspl.modules.agent import Agent, agent_directory
+from torchrl_sspl.modules.agent import Agent, agent_directory, hosted
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.episodes import Episodes, random_actions, run_episodes
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
@@ -79,7 +79,7 @@ def certify(
     """
     certificate = _proved(agent, name, level, budget)
     if env is not None:
-        sample, conditions = _measure(agent, env, certificate.level, episodes, horizon, seed, progress)
+        sample, conditions = _measure(hosted(agent), env, certificate.level, episodes, horizon, seed, progress)
         _add_measured(certificate, sample, conditions)
     return certificate
 
@@ -133,7 +133,7 @@ def certify_on_episodes(
         chance = run_episodes(agent, env, episodes, horizon, random_actions(env, seed + 1))
     finally:
         env.close()
-    sample, conditions = _measure_episodes(agent, own, chance, certificate.level, seed, used_seeds)
+    sample, conditions = _measure_episodes(hosted(agent), own, chance, certificate.level, seed, used_seeds)
     _add_measured(certificate, sample, conditions)
     return certificate
 

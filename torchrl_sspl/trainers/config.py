@@ -217,7 +217,8 @@ class TrainingConfig:
             "smoke" (seconds, for tests).
         seed: seed of data, initial weights and batches.
         out_dir: directory of the run.
-        device: device of the warm start, the part that works on pixels; what follows stays on the CPU.
+        device: device of what works on pixels: the warm start and, with the preset "paper", the joint training; what
+            follows stays on the CPU.
         checkpoint_seconds: seconds between checkpoints.
         progress: show progress bars.
         network: sizes of the networks.

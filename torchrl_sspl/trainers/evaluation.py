@@ -16,7 +16,7 @@ from torchrl_sspl.certification.ground_truth import ViabilityKernel, recoverable
 from torchrl_sspl.certification.statistics import clopper_pearson
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.lipschitz import lipschitz_lower
-from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.agent import Agent, hosted
 from torchrl_sspl.sets import SAFE, Region
 from torchrl_sspl.trainers.config import EvaluationConfig
 
@@ -114,7 +114,7 @@ def encode_states(agent: Agent, env: SafetyEnv, state: Tensor, *, draw: Draw | N
 
     Source: none.
     """
-    draw = draw or env.draw
+    agent, draw = hosted(agent), draw or env.draw
     if not len(state):
         return torch.zeros(0, agent.latent_dim)
     return torch.cat(
@@ -203,6 +203,7 @@ def rollout(
 
     Source: paper Section V (trajectories from the learned policy).
     """
+    agent = hosted(agent)
     observer = _Observer(agent, env, draw or env.draw)
     state = start
     latent = observer.start(env.previous_state(start), start)
@@ -286,7 +287,7 @@ def evaluate(
 
     Source: paper Section V shows figures only; the measurements are this library's.
     """
-    config = config or EvaluationConfig()
+    agent, config = hosted(agent), config or EvaluationConfig()
     n_rollouts = config.rollouts if rollouts is None else rollouts
     generator = torch.Generator().manual_seed(config.seed)
     kernel = kernel or viability_kernel(env, resolution=config.kernel_grid)

@@ -25,6 +25,7 @@ from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.data.collect import make_collector
+from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, EmptyRegionError, MissingDependencyError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
@@ -185,7 +186,7 @@ class Experiment:
         self.make_env = EnvFactory(config.env) if make_env is None else make_env
         self.directory = Path(config.out_dir)
         self.directory.mkdir(parents=True, exist_ok=True)
-        self.device = torch.device(config.device)
+        self.device = usable_device(config.device)
         env = self.make_env(batch_size=[1], seed=config.seed)
         missing = {"pixels", "region"} - set(env.observation_spec.keys())
         if missing:

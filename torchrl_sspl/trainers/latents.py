@@ -555,7 +555,7 @@ class LatentTraining:
     def _restore(self) -> None:
         path = self.out_dir / CHECKPOINT_FILE
         try:
-            body = torch.load(path, weights_only=True)
+            body = torch.load(path, map_location="cpu", weights_only=True)  # the run may go on elsewhere
         except Exception as error:
             raise CheckpointError(
                 f"expected a readable checkpoint at '{path}', received {type(error).__name__}; delete it to start again"

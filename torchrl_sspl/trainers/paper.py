@@ -47,6 +47,10 @@ class PaperTraining(SafePolicyTraining):
     def _size(self, name: str) -> int:
         return self.config.synthesis.tune_steps if name == "joint" else super()._size(name)
 
+    def _device_of(self, phase: str) -> torch.device | str:
+        """Every phase works on pixels."""
+        return self.device
+
     def _after_step(self) -> None:
         """The separate step on L_M; both it and the step before are pulled back into the cone where they would leave it."""
         barrier = self.warm_barrier
@@ -73,7 +77,8 @@ class PaperTraining(SafePolicyTraining):
         else:
             policy = make_rollout_policy(self.encoder, self.policy)
             rollouts = collect_rollouts(
-                self._env_for(), policy, s.rollout_transitions, seed=self.config.seed + 1000 * (number + 1), steps=20
+                self._env_for(), policy, s.rollout_transitions, seed=self.config.seed + 1000 * (number + 1), steps=20,
+                policy_device=self.device, env_device="cpu", storing_device="cpu",
             )
             folder.mkdir(exist_ok=True)
             rollouts.dumps(folder / "store")
@@ -84,7 +89,7 @@ class PaperTraining(SafePolicyTraining):
             preset="paper", reduction="mean", policy_coeff=s.deviation_coeff,
             safety_margin=psi, dynamics_margin=eta,
             consistency_coeff=rep.consistency_coeff,
-        )
+        ).to(self.device)
         self._log({"step": 0, "safety_margin": psi, "dynamics_margin": eta, "dynamics_error": delta, "covering_radius": radius})
         networks: dict[nn.Module, float] = dict.fromkeys(
             (self.encoder, self.warm_dynamics, self.warm_barrier, self.policy), s.lr
@@ -102,7 +107,8 @@ class PaperTraining(SafePolicyTraining):
         """psi and eta as the paper prints them: on the training samples themselves."""
         bound = self.config.network.lipschitz_bound
         data = self._encode_store(store)
-        error = dynamics_error(self.warm_dynamics(data["latent"], data["action"]), data["next_latent"]).max()
+        predicted = self.warm_dynamics(data["latent"].to(self.device), data["action"].to(self.device)).cpu()
+        error = dynamics_error(predicted, data["next_latent"]).max()
         half = len(data["latent"]) // 2
         radius = covering_radius(data["latent"][:half], data["latent"][half:])
         psi = safety_margin(bound, radius, mode="paper").q1

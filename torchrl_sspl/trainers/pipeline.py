@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
+from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
@@ -101,7 +102,7 @@ class SafePolicyTraining(LatentTraining):
         # What the parts below and a checkpoint refer to comes before the latter is read.
         self.config, self.make_env = config, make_env
         self.env = make_env([1], config.seed)
-        self.device = torch.device(config.device)
+        self.device = usable_device(config.device)
         self.best: dict[str, Any] | None = None
         self.checks: list[Check] = []
         sizes: dict[str, Any] = {"latent_dim": config.network.latent_dim, "action_dim": self.env.action_dim}
@@ -346,7 +347,8 @@ class SafePolicyTraining(LatentTraining):
         return self._encode_store(store)
 
     def _encode_store(self, store: TransitionStore) -> dict[str, Tensor]:
-        return encode_transitions(lambda batch: self.encoder.sequence(batch["frames"]).unbind(1), store)
+        device = next(self.encoder.parameters()).device
+        return encode_transitions(lambda batch: self.encoder.sequence(batch["frames"].to(device)).unbind(1), store)
 
     # ------------------------------------------------------------------ agent
 

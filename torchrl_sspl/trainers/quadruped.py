@@ -16,7 +16,7 @@ from tqdm import tqdm
 from torchrl_sspl.certification.ground_truth import ViabilityKernel, viability_kernel
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.agent import Agent, hosted
 from torchrl_sspl.trainers.config import EvaluationConfig
 from torchrl_sspl.trainers.evaluation import Evaluation, Measurement, encode_states, evaluate, share
 from torchrl_sspl.trainers.requirements import Requirement
@@ -117,6 +117,7 @@ def evaluate_dubins(
 
     Source: none.
     """
+    agent = hosted(agent)
     headings = min(STATE_GRID[2], config.grid) + 1  # the last is the first again
     grid: Any = (config.grid, config.grid, headings)
     out = evaluate(agent, env, config, kernel=kernel or kernel_of(env), grid=grid, progress=progress)
@@ -146,6 +147,7 @@ def latency(agent: Agent, env: DubinsEnv, frames: int = 400) -> Measurement:
 
     Source: none.
     """
+    agent = hosted(agent)
     pixels = env.observe(env.sample_states(20, torch.Generator().manual_seed(0)))
     seconds = []
     for k in range(frames + 20):
@@ -183,6 +185,7 @@ def walk(
 
     Source: paper Section IV-B (the learned policy on the quadruped).
     """
+    agent = hosted(agent)
     pixels, info = env.reset(seed=seed, options={"pose": [float(v) for v in start]})
     poses, actions, values, frames = [info["pose"]], [], [], [pixels[3:]]
     entered, hit, fallen, left = bool(info["unsafe"]), False, False, False
@@ -233,7 +236,7 @@ def evaluate_walks(
 
     Source: none (the paper shows pictures).
     """
-    config = config or WalkConfig()
+    agent, config = hosted(agent), config or WalkConfig()
     generator = torch.Generator().manual_seed(config.seed)
     n, steps = config.episodes, max(1, round(config.seconds / model.dt))
     out = Evaluation()

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.modules.agent import Agent, hosted
 from torchrl_sspl.viz.plane import BARRIER_COLOUR, PATH_COLOURS, Plane, array, new_figure, require, zero_level
 
 _WIDTH, _HEIGHT, _DPI = 9.6, 5.4, 80  # 768 x 432 pixels: even, as the video codec wants them
@@ -71,6 +72,7 @@ def animate(
         warnings.warn("imageio-ffmpeg is not installed; the film becomes a gif.", stacklevel=2)
         path = path.with_suffix(".gif")
 
+    agent = hosted(agent) if isinstance(agent, Agent) else agent
     state, previous = env.wrap(first[None]), None
     states, pictures, values, actions = [], [], [], []
     for _ in range(steps + 1):

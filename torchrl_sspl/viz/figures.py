@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.viz.curves import training_curves
@@ -164,8 +164,10 @@ def latent_space(
 
 
 def _evaluate(barrier: Callable[[Tensor], Tensor], latent: np.ndarray) -> np.ndarray:
+    points = torch.as_tensor(latent, dtype=torch.float32)
+    weight = next(barrier.parameters(), points) if isinstance(barrier, nn.Module) else points
     with torch.no_grad():
-        value = barrier(torch.as_tensor(latent, dtype=torch.float32))
+        value = barrier(points.to(weight.device)).cpu()
     if value.shape != (len(latent), 1):
         raise ShapeError(f"barrier: expected values of shape ({len(latent)}, 1), received {tuple(value.shape)}.")
     return value[:, 0].double().numpy()

@@ -1,0 +1,58 @@
+"""The tests that need a GPU, on a simulated one: every tensor has to be on the device where a GPU would want it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from simulated_cuda import build
+
+HERE = Path(__file__).parent
+COMPILER = os.environ.get("CXX") or shutil.which("c++")
+pytestmark = [
+    pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler"),
+    pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU: run the tests marked gpu on it"),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="replaces functions of torch as Linux links them"),
+]
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory) -> dict[str, str]:
+    library = build(COMPILER, tmp_path_factory.mktemp("device"))
+    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH", "")]))
+    return os.environ | {"SIMULATED_CUDA": str(library), "PYTHONPATH": path}
+
+
+def python(environment: dict[str, str], *arguments: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, env=environment, cwd=HERE.parents[1], capture_output=True, text=True, timeout=900)
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("there + here", "Expected all tensors to be on the same device"),
+        ("torch.where(there > 0, there, here)", "Expected all tensors to be on the same device"),
+        ("torch.nn.functional.linear(here, there[None])", "Expected all tensors to be on the same device"),
+        ("here[there.long()]", "on the same device"),
+        ("torch.rand(3, device='cuda', generator=torch.Generator())", "Expected a 'cuda' device type for generator"),
+        ("there.numpy()", "can't convert cuda:0 device type tensor to numpy"),
+    ],
+)
+def test_it_refuses_what_a_gpu_refuses(environment, code, message):
+    start = "import simulated_cuda, torch; here = torch.ones(3); there = here.cuda(); there[here.long() - 1] + 1; "
+    assert python(environment, "-c", start).returncode == 0
+    found = python(environment, "-c", start + code)
+    assert found.returncode == 1
+    assert message in found.stderr
+
+
+def test_what_needs_a_gpu_works_on_it(environment):
+    found = python(environment, "-m", "pytest", "-p", "simulated_cuda", "-p", "no:cacheprovider", "-m", "gpu", "-rs", "tests")
+    assert found.returncode == 0, found.stdout[-8000:]
+    assert "skipped" not in found.stdout, found.stdout[-2000:]
