@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+from pathlib import Path
 
 import pytest
 import torch
@@ -144,28 +145,31 @@ def test_experiments_train_on_the_gpu_and_return_an_agent_on_the_cpu(options, tm
     assert outcome.evaluation["starts_inside"] is not None
 
 
-def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(tmp_path):
-    def experiment(name: str) -> Experiment:
-        options = ["trainer.checkpoint_every=256", "device=cuda", f"out_dir={tmp_path / name}"]
-        return Experiment(experiment_config([*TINY, *options]))
+def saving_experiment(directory: Path, device: str) -> Experiment:
+    options = ["trainer.checkpoint_every=256", f"device={device}", f"out_dir={directory}"]
+    return Experiment(experiment_config([*TINY, *options]))
 
-    class Interrupted(Exception): ...
 
-    whole = experiment("whole")
-    whole.train()
-    broken = experiment("broken")
-    updates, batches = broken.trainer.optim_steps, []
+def interrupt(experiment: Experiment) -> None:
+    """Train until the second batch is about to be learnt from."""
+    updates, batches = experiment.trainer.optim_steps, []
 
-    def interrupt(batch: TensorDict) -> None:
+    def once(batch: TensorDict) -> None:
         batches.append(batch)
         if len(batches) == 2:
-            raise Interrupted
+            raise InterruptedError
         updates(batch)
 
-    broken.trainer.optim_steps = interrupt
-    with pytest.raises(Interrupted):
-        broken.train()
-    resumed = experiment("broken")
+    experiment.trainer.optim_steps = once
+    experiment.train()
+
+
+def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(tmp_path):
+    whole = saving_experiment(tmp_path / "whole", "cuda")
+    whole.train()
+    with pytest.raises(InterruptedError):
+        interrupt(saving_experiment(tmp_path / "broken", "cuda"))
+    resumed = saving_experiment(tmp_path / "broken", "cuda")
     resumed.train(resume=True)
     found = resumed.loss.state_dict()
     for key, value in whole.loss.state_dict().items():

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from simulated_cuda import build
+from test_gpu import saving_experiment
 
 HERE = Path(__file__).parent
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
@@ -24,7 +25,7 @@ pytestmark = [
 @pytest.fixture(scope="module")
 def environment(tmp_path_factory) -> dict[str, str]:
     library = build(COMPILER, tmp_path_factory.mktemp("device"))
-    path = os.pathsep.join(filter(None, [str(HERE), os.environ.get("PYTHONPATH", "")]))
+    path = os.pathsep.join(filter(None, [str(HERE), str(HERE.parent), os.environ.get("PYTHONPATH", "")]))
     return os.environ | {"SIMULATED_CUDA": str(library), "PYTHONPATH": path}
 
 
@@ -50,6 +51,16 @@ def test_it_refuses_what_a_gpu_refuses(environment, code, message):
     found = python(environment, "-c", start + code)
     assert found.returncode == 1
     assert message in found.stderr
+
+
+def test_a_run_that_began_on_a_gpu_goes_on_without_one(environment, tmp_path):
+    code = "import simulated_cuda, test_gpu; from pathlib import Path; "
+    code += f"test_gpu.interrupt(test_gpu.saving_experiment(Path({str(tmp_path)!r}), 'cuda'))"
+    assert "InterruptedError" in python(environment, "-c", code).stderr
+    experiment = saving_experiment(tmp_path, "cpu")
+    experiment.train(resume=True)
+    assert experiment.resumed
+    assert experiment.trainer.collected_frames == 512
 
 
 def test_what_needs_a_gpu_works_on_it(environment):

@@ -26,6 +26,14 @@ from torchrl_sspl.trainers.stepper import SSPLStepper
 Call = Callable[["SSPLTrainer"], Mapping[str, Any]]
 
 
+class _RNGState(GlobalRNGState):
+    """Random numbers of the process; a run that began on a GPU may go on without one."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        lacking = set() if torch.cuda.is_available() else {"torch_cuda"}
+        super().load_state_dict({k: v for k, v in state_dict.items() if k not in lacking})
+
+
 class SSPLTrainer(Trainer):
     r"""Algorithm 1 on TorchRL's trainer.
 
@@ -148,7 +156,7 @@ class SSPLTrainer(Trainer):
         if checkpoint_dir is not None:
             trainer_options |= {
                 # In name order the generator comes after what might draw from it, the collector.
-                "checkpoint": Checkpoint(rng=GlobalRNGState()),
+                "checkpoint": Checkpoint(rng=_RNGState()),
                 "checkpoint_rotation": CheckpointRotation(checkpoint_dir, keep_last=keep_checkpoints),
                 # TorchRL saves when more than this number was collected.
                 "save_trainer_interval": checkpoint_every - 1,
