@@ -24,9 +24,11 @@ from torchrl_sspl.certification.layers import (
     paper_layer,
     statistical_layer,
 )
+from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CertificationError, CheckpointError, ConfigError
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.agent import Agent, load
+from torchrl_sspl.trainers import certify as certify_module
 from torchrl_sspl.trainers.certify import certify, verify_run
 
 
@@ -382,3 +384,19 @@ def test_numbers_out_of_range_are_errors():
     with pytest.raises(ConfigError, match="confidence"):
         statistical_layer(sample(), confidence=1.0)
     assert len(DETERMINISTIC) + len(STATISTICAL) + len(FILES) >= 50
+
+
+def test_an_empty_set_is_not_searched_for_ever(monkeypatch):
+    agent, env, seen = load("pendulum"), PendulumEnv(batch_size=[1]), []
+    agent.barrier[-1].bias += 10.0
+    draw = certify_module.encode_states
+
+    def counted(agent: Agent, env: PendulumEnv, state: Tensor) -> Tensor:
+        seen.append(len(state))
+        return draw(agent, env, state)
+
+    monkeypatch.setattr(certify_module, "encode_states", counted)
+    certificate = certify(agent, env, level=0.0, episodes=5, horizon=2, budget=Budget(seconds=5.0))
+    assert seen == [10] * 10 + [5, 5, 20]  # the search, U, S, the reference
+    assert Reason.EMPTY in certificate.layers["deterministic"].reasons
+    assert not certificate.layers["statistical"].holds

@@ -304,7 +304,7 @@ class Experiment:
         return trainer
 
     def _evaluate_during(self, trainer: SSPLTrainer) -> dict[str, Any]:
-        return logged(evaluate_episodes(self.agent(), self.make_env, self.config.evaluation))
+        return logged(evaluate_episodes(self.agent().to(self.device), self.make_env, self.config.evaluation))
 
     def agent(self, level: float = 0.0) -> Agent:
         """A frozen copy of the present networks, the barrier collapsed to a plain network and shifted.
@@ -419,7 +419,7 @@ class Experiment:
         seed = e.seed + 1000
         env = self.make_env(batch_size=[e.envs], seed=seed)
         try:
-            agent = self.agent()
+            agent = self.agent().to(self.device)
             held_out = [
                 run_episodes(agent, env, e.episodes, e.horizon),
                 run_episodes(agent, env, e.episodes, e.horizon, random_actions(env, seed + 1)),
@@ -468,8 +468,9 @@ class Experiment:
         """
         (self.directory / "config.json").write_text(json.dumps(self.config.to_dict(), indent=1) + "\n")
         agent = self.train(resume=resume)
-        evaluation = evaluate_episodes(agent, self.make_env, self.config.evaluation)
-        certificate = self._certificate(agent)
+        there = copy.deepcopy(agent).to(self.device)
+        evaluation = evaluate_episodes(there, self.make_env, self.config.evaluation)
+        certificate = self._certificate(there)
         outcome = ExperimentOutcome(self.directory, agent, evaluation, certificate, self.seconds, None, self.warnings)
         body = {"seed": self.config.seed, "training_seconds": self.seconds, "measurements": evaluation.to_dict(),
                 "lipschitz": {k: v for k, v in agent.description["lipschitz"].items() if k != "multipliers"},

@@ -232,7 +232,7 @@ class TrainerConfig:
         warm_start_error: share of S and U on the wrong side of the barrier, summed, down to which the world model alone goes
             on being trained; "none" goes by the steps alone.
         restarts: fresh starts with other initial weights, at most, where after warm_start_steps that share exceeds
-            warm_start_error and no longer falls; 0 for none.
+            warm_start_error and no longer falls; 0 for none. Without a warm start there is nothing to judge by, and none happens.
         clip_norm: bound on the norm of the gradient.
         checkpoint_every: transitions between checkpoints; negative for none.
         keep_checkpoints: checkpoints that are kept.
