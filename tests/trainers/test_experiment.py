@@ -14,10 +14,13 @@ from tensordict import TensorDict
 from tiny import TINY_EXPERIMENT
 from torch import nn
 
+from torchrl_sspl.certification import Reason
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.agent import Agent, mlp_barrier
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+from torchrl_sspl.trainers import certify as certify_module
+from torchrl_sspl.trainers import certify_on_episodes
 from torchrl_sspl.trainers.episodes import Episodes, evaluate_episodes, run_episodes, separating_level
 from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy
 from torchrl_sspl.trainers.experiment_config import EpisodesConfig, experiment_config
@@ -112,6 +115,40 @@ def test_prediction_errors_compare_with_what_was_seen():
     off.dynamics.forward = lambda latent, action: latent
     wrong = run_episodes(off, lane((4,)), 4, horizon=3)
     assert wrong.prediction_error[wrong.alive[1:]] == pytest.approx(1 / 16)
+
+
+@pytest.mark.parametrize(
+    ("border", "drawn"),
+    [
+        pytest.param(8.9, [40], id="all starts inside"),
+        pytest.param(2.4, [40] + 8 * [10], id="a quarter of them"),
+        pytest.param(-1.0, [40], id="none"),
+    ],
+)
+def test_certificates_draw_until_enough_episodes_count(border, drawn, monkeypatch):
+    asked, at_random = [], []
+
+    def counted(agent, env, n, horizon, act=None):
+        (asked if act is None else at_random).append(n)
+        return run_episodes(agent, env, n, horizon, act)
+
+    monkeypatch.setattr(certify_module, "run_episodes", counted)
+    certificate = certify_on_episodes(agent(0.0, border), lane, level=0.0, episodes=40, horizon=3, envs=20)
+    assert asked == drawn
+    assert sum(at_random) == 120  # three steps seldom lead into U
+    measured = certificate.layers["statistical"]
+    if border < 0:
+        assert Reason.NOT_MEASURED in measured.reasons
+    else:
+        assert measured["episodes"].n == pytest.approx(sum(drawn) * (1.0 if border > 8 else 0.25), rel=0.5)
+
+
+def test_joined_episodes_are_both():
+    first, second = (run_episodes(agent(1.0), lane((4,), seed), 4, horizon=3) for seed in (0, 1))
+    both = first.joined(second)
+    assert both.alive.shape == (4, 8)
+    assert torch.equal(both.latent[:, 4:], second.latent)
+    assert torch.equal(both.film, first.film)
 
 
 def test_measurements_count_episodes():

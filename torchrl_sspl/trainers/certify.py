@@ -100,14 +100,16 @@ def certify_on_episodes(
     r"""Certifies a frozen agent for an environment that is known only by being run.
 
     What the weights prove is the same as with :func:`certify`. What is measured are episodes from the environment's own
-    resets: those that start in the set, and one observation of U, the lowest, of every episode that shows any.
+    resets: those that start in the set, and one observation of U, the lowest, of every episode that shows any. Episodes are
+    drawn until there are enough of both; when to stop depends on their numbers alone, never on what happened in them.
 
     Args:
         agent: frozen agent.
         make_env: ``(batch_size=[k], seed=...) -> environment`` with ``"pixels"`` and ``"region"``.
         name: name of the agent.
         level: s, barrier units; searched for if not given.
-        episodes: fresh episodes under the policy, and as many under random actions.
+        episodes: number of fresh episodes from the set, and of fresh episodes that show U. At least as many are drawn
+            under the policy, and under random actions, and at most three times as many.
         horizon: steps per episode.
         envs: environments stepped together.
         seed: seed of the fresh episodes; must not have been used for anything else.
@@ -129,13 +131,29 @@ def certify_on_episodes(
     certificate = _proved(agent, name, level, budget)
     env = make_env(batch_size=[envs], seed=seed)
     try:
-        own = run_episodes(agent, env, episodes, horizon)
-        chance = run_episodes(agent, env, episodes, horizon, random_actions(env, seed + 1))
+        random, level = random_actions(env, seed + 1), certificate.level
+        own = _until(lambda n: run_episodes(agent, env, n, horizon), episodes, lambda e: e.barrier[0] <= level)
+        seen = int(_shows_unsafe(own).sum())
+        chance = _until(lambda n: run_episodes(agent, env, n, horizon, random), episodes, _shows_unsafe, seen)
     finally:
         env.close()
     sample, conditions = _measure_episodes(hosted(agent), own, chance, certificate.level, seed, used_seeds)
     _add_measured(certificate, sample, conditions)
     return certificate
+
+
+def _shows_unsafe(episodes: Episodes) -> Tensor:
+    return ((episodes.region == UNSAFE) & episodes.alive).any(0)
+
+
+def _until(
+    draw: Callable[[int], Episodes], n: int, counted: Callable[[Episodes], Tensor], already: int = 0
+) -> Episodes:
+    """Episodes, at least n and at most 3 n, until n are counted; where none is, n."""
+    found = draw(n)
+    while 0 < int(counted(found).sum()) < n - already and found.alive.shape[1] < 3 * n:
+        found = found.joined(draw(max(1, n // 4)))
+    return found
 
 
 def _proved(agent: Agent, name: str, level: float | None, budget: Budget | None) -> Certificate:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -40,6 +40,11 @@ class Episodes:
     alive: Tensor
     prediction_error: Tensor
     film: Tensor
+
+    def joined(self, others: Episodes) -> Episodes:
+        """These episodes and others of the same length, with the film of these."""
+        names = [f.name for f in fields(self) if f.name != "film"]
+        return Episodes(**{k: torch.cat([getattr(self, k), getattr(others, k)], 1) for k in names}, film=self.film)
 
 
 @torch.no_grad()

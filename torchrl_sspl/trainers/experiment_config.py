@@ -313,8 +313,8 @@ class EpisodesConfig:
         seed: seed of the evaluation's own random numbers.
         calibrate: shift the barrier so that it separates held-out S and U before anything is measured.
         guard: distance that held-out observations of U keep from the zero level (units of the barrier).
-        certificate_episodes: further episodes, as many under the policy as under random actions, behind what the
-            certificate measures (0: it says only what the weights prove).
+        certificate_episodes: further episodes from the set, and further ones that show U, behind what the certificate
+            measures; for these up to three times as many are drawn (0: it says only what the weights prove).
         certificate_seconds: after which each search for a proof gives up.
     """
 
