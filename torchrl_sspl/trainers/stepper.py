@@ -132,14 +132,14 @@ class SSPLStepper(OptimizationStepper):
             terms = trainer.compute_loss(sub_batch)
             counted = [v for k, v in terms.items() if k.startswith("loss_") and (not warm or k in WARM_TERMS)]
             total: Tensor = sum(counted)  # type: ignore[assignment]
-        if blind:
-            self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
         self.optimizer.zero_grad()
         total.backward()
         norm = self._clip(trainer)
         before = self._barrier_state()
         self.optimizer.step()
         self._backtrack(before)
+        if blind:  # only now: a GPU is waited for here
+            self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
         output = dict(terms.detach().items())
         output["grad_norm"] = norm.detach()
         output["warm_start"] = torch.tensor(float(warm))
