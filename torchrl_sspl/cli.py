@@ -221,7 +221,7 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
     if experiment:
         from torchrl_sspl.trainers.episodes import evaluate_episodes
 
-        if not experiment.get("env"):
+        if "_target_" not in (experiment.get("env") or {}):
             raise CheckpointError(
                 f"expected the agent in '{directory}' to name its environment, found none: it was given in code; call "
                 "evaluate_episodes(agent, make_env) there"

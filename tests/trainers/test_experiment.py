@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import shutil
+from functools import partial
 from types import SimpleNamespace
 
 import gymnasium
@@ -14,15 +16,17 @@ from tensordict import TensorDict
 from tiny import TINY_EXPERIMENT
 from torch import nn
 
-from torchrl_sspl.certification import Reason
+from torchrl_sspl.certification import Certificate, Layer, Reason, Statement
+from torchrl_sspl.cli import evaluate_agent
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.agent import Agent, mlp_barrier
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 from torchrl_sspl.trainers import certify as certify_module
 from torchrl_sspl.trainers import certify_on_episodes
+from torchrl_sspl.trainers.description import describe, differences
 from torchrl_sspl.trainers.episodes import Episodes, evaluate_episodes, run_episodes, separating_level
-from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy
+from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy, advice, run_experiment
 from torchrl_sspl.trainers.experiment_config import EpisodesConfig, experiment_config
 from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.latents import LatentTraining
@@ -53,9 +57,9 @@ class Lane(gymnasium.Env):
         return picture
 
 
-def lane(batch_size=(4,), seed=0, **options) -> GymnasiumPixels:
+def lane(batch_size=(4,), seed=0, make=Lane, **options) -> GymnasiumPixels:
     sets = {"safe": lambda state, info: state[0] < 3, "unsafe": lambda state, info: state[0] > 10}
-    return GymnasiumPixels(Lane, batch_size=batch_size, seed=seed, image_size=16, **sets, **options)
+    return GymnasiumPixels(make, batch_size=batch_size, seed=seed, image_size=16, **(sets | options))
 
 
 class Where(nn.Module):
@@ -128,9 +132,9 @@ def test_prediction_errors_compare_with_what_was_seen():
 def test_certificates_draw_until_enough_episodes_count(border, drawn, monkeypatch):
     asked, at_random = [], []
 
-    def counted(agent, env, n, horizon, act=None):
+    def counted(agent, env, n, horizon, act=None, **options):
         (asked if act is None else at_random).append(n)
-        return run_episodes(agent, env, n, horizon, act)
+        return run_episodes(agent, env, n, horizon, act, **options)
 
     monkeypatch.setattr(certify_module, "run_episodes", counted)
     certificate = certify_on_episodes(agent(0.0, border), lane, level=0.0, episodes=40, horizon=3, envs=20)
@@ -208,8 +212,8 @@ SMALL = [
 ]  # fmt: skip
 
 
-def everywhere(batch_size, seed) -> GymnasiumPixels:
-    return lane(batch_size, seed, reset_options={"below": 13})
+def everywhere(batch_size, seed, below=13) -> GymnasiumPixels:
+    return lane(batch_size, seed, reset_options={"below": below})
 
 
 def build(folder, *more: str) -> Experiment:
@@ -354,9 +358,95 @@ def test_a_finished_experiment_is_not_trained_again_and_another_one_is_refused(t
     assert again.trainer.optimization_stepper.count == 2 * 2
     assert all(torch.equal(value, weights[name]) for name, value in first.items())
     other = build(tmp_path, "trainer.total_frames=128", "network.barrier_hidden=[16]")
-    with pytest.raises(CheckpointError, match="checkpoint of this trainer"):
+    with pytest.raises(CheckpointError, match=r"barrier_hidden: \[8\], now \[16\]\); use another out_dir"):
         other.train()
     other.trainer.collector.shutdown()
+    config = experiment_config([*SMALL, "trainer.total_frames=128", f"out_dir={tmp_path}"], **{"logger.kind": "none"})
+    moved = Experiment(config, partial(everywhere, below=12))
+    with pytest.raises(CheckpointError, match=r"env.*now.*use another out_dir"):
+        moved.train()
+    moved.trainer.collector.shutdown()
+
+
+LIMIT = 1.0
+
+
+def near(state, info):
+    return abs(state[0]) < LIMIT
+
+
+def test_descriptions_tell_systems_apart(monkeypatch):
+    def system(border: float, **more):
+        return partial(GymnasiumPixels, Lane, safe=near, unsafe=lambda state, info: state[0] > border, **more)
+
+    one = describe(system(2.0, image_size=32))
+    assert one == describe(system(2.0, image_size=32)) == json.loads(json.dumps(one))
+    assert one["made by"] == "torchrl_sspl.envs.gymnasium.GymnasiumPixels"
+    assert differences(one, describe(system(2.0, image_size=48))) == ["image_size: 32, now 48"]
+    assert [d.split(":")[0] for d in differences(one, describe(system(3.0, image_size=32)))] == ["unsafe"]
+    monkeypatch.setitem(globals(), "LIMIT", 2.0)
+    assert [d.split(":")[0] for d in differences(one, describe(system(2.0, image_size=32)))] == ["safe"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"make_env": lane()}, "make_env: expected a function .* received an object of type GymnasiumPixels"),
+        ({"make_env": Lane}, "make_env: expected a function .* received one that raises TypeError"),
+        ({"encoder": Where()}, "encoder: expected a class or a function .* received a module; give its class, Where"),
+        ({"encoder": Where}, "encoder: expected a class or a function .* received one that raises TypeError"),
+        ({"encoder": lambda p: nn.Flatten()}, r"shape \(\*batch, network.latent_dim=3\), received \(1, 1536\)"),
+        ({"encoder": lambda p: nn.Sequential(nn.Flatten(), nn.Linear(1536, p))}, "received RuntimeError.*begins with pixels.float"),
+        ({"encoder": lambda p: Scaled(p, 9.0)}, r"latents in \[-1, 1\], received up to .*nn.Tanh"),
+        ({"overrides": "seed=1"}, "overrides: expected a list of key=value strings .*, received a str"),
+        ({"overrides": {"seed": 1}}, "overrides: expected a list of key=value strings .*, received a dict"),
+        ({"overrides": ["env.image_size=48"]}, "no setting of env .* received env.image_size; set it there"),
+        ({"make_env": partial(lane, make=Lane())}, "make: expected a function that makes an environment"),
+        ({"make_env": partial(lane, reset_options=lambda: {})}, "reset_options: expected a mapping, or a function"),
+        ({"make_env": partial(lane, safe=lambda state: True)}, r"safe: expected a predicate \(observation, info\)"),
+        ({"make_env": partial(lane, unsafe=lambda s, i: np.ones(2) > s)}, "unsafe: expected a predicate .* ValueError"),
+    ],
+)
+def test_mistakes_are_named_before_anything_is_trained(options, message, tmp_path):
+    given = {"make_env": lane, "overrides": [], **options}
+    with pytest.raises(ConfigError, match=message):
+        run_experiment(given.pop("make_env"), given.pop("overrides"), out_dir=str(tmp_path), **given)
+
+
+class Scaled(nn.Module):
+    def __init__(self, latent_dim: int, scale: float) -> None:
+        super().__init__()
+        self.latent_dim, self.scale = latent_dim, scale
+
+    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
+        return self.scale * torch.ones(len(pixels), self.latent_dim)
+
+
+def test_advice_follows_the_reasons(tmp_path):
+    def said(deterministic: str, statistical: str) -> list[str]:
+        rows = {"deterministic": deterministic, "statistical": statistical}
+        layers = {
+            name: Layer(name, [Statement("s", "s", "measured", not reason, reason=reason)]) for name, reason in rows.items()
+        }
+        return advice(Certificate("a", "w", "c", 0.0, layers), experiment_config())
+
+    assert said("", "") == []
+    (line,) = said("NOT_INVARIANT", "EPISODES_LEAVE")
+    assert "network.latent_dim, now 3" in line
+    assert "network.pool_to = 32" in line
+    assert "certificate_episodes, now 1000" in said("", "TOO_FEW")[0]
+    assert len(said("UNDECIDED", "UNSAFE_INSIDE")) == 2
+
+
+def test_an_agent_of_a_system_in_code_is_not_measured_on_another(tmp_path):
+    build(tmp_path, "trainer.total_frames=128").train()
+    with pytest.raises(CheckpointError, match="it was given in code; call evaluate_episodes"):
+        evaluate_agent(str(tmp_path))
+
+
+def test_certificates_say_how_long_episodes_were():
+    certificate = certify_on_episodes(agent(0.0), partial(lane, horizon=5), level=0.0, episodes=8, horizon=9, envs=4)
+    assert certificate.layers["statistical"]["episodes"].text.startswith("episodes of 5 steps")
 
 
 def test_environments_without_labels_are_refused(tmp_path):

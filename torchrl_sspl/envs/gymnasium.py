@@ -111,6 +111,11 @@ class GymnasiumPixels(EnvBase):
             raise ConfigError("horizon: expected an integer >= 1 with ignore_termination, received None.")
         if not isinstance(image_size, int) or image_size < 8:
             raise ConfigError(f"image_size: expected an integer >= 8, received {image_size!r}.")
+        if not callable(make):
+            raise ConfigError(
+                "make: expected a function that makes an environment of gymnasium, such as partial(gymnasium.make, 'CartPole-v1', "
+                f"render_mode='rgb_array'), received an object of type {type(make).__name__}."
+            )
         super().__init__(device=usable_device(device or "cpu"), batch_size=size)
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.image_size, self.horizon = image_size, horizon
@@ -202,13 +207,31 @@ class GymnasiumPixels(EnvBase):
         return frame
 
     def _region(self, observation: Any, info: Mapping[str, Any]) -> int:
-        safe, unsafe = bool(self._safe(observation, info)), bool(self._unsafe(observation, info))
+        safe, unsafe = (self._judged(name, observation, info) for name in ("safe", "unsafe"))
         if safe and unsafe:
             raise OverlapError(
                 "safe and unsafe: expected predicates that exclude each other, received a state that both claim; "
                 "make one of them smaller."
             )
         return SAFE if safe else UNSAFE if unsafe else UNLABELLED
+
+    def _judged(self, name: str, observation: Any, info: Mapping[str, Any]) -> bool:
+        try:
+            return bool(self._safe(observation, info) if name == "safe" else self._unsafe(observation, info))
+        except (TypeError, ValueError, LookupError) as error:
+            raise ConfigError(
+                f"{name}: expected a predicate (observation, info) -> bool of one state, received {type(error).__name__}: {error}"
+            ) from error
+
+    def _options(self) -> dict[str, Any] | None:
+        try:
+            options = self.reset_options(self._random) if callable(self.reset_options) else self.reset_options
+            return None if options is None else dict(options)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(
+                "reset_options: expected a mapping, or a function numpy generator -> mapping, received "
+                f"{type(error).__name__}: {error}"
+            ) from error
 
     def _advance(self, env: Any, action: np.ndarray) -> tuple[Any, float, bool, bool, Mapping[str, Any]]:
         """``action_repeat`` steps of gymnasium; rewards add up, the end of an episode ends them too."""
@@ -225,9 +248,9 @@ class GymnasiumPixels(EnvBase):
         """Reset one environment and, to settle it, let one step pass; returns the frame of the reset."""
         env = self._envs[index]
         for _ in range(_ATTEMPTS):
-            options = self.reset_options(self._random) if callable(self.reset_options) else self.reset_options
+            options = self._options()
             seed = int(self._random.integers(2**31 - 1))
-            observation, info = env.reset(seed=seed, options=None if options is None else dict(options))
+            observation, info = env.reset(seed=seed, options=options)
             before = self._draw(index, observation)
             if not self.settle:
                 break

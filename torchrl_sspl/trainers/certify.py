@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -33,7 +34,7 @@ from torchrl_sspl.errors import CertificationError, ConfigError
 from torchrl_sspl.functional import covering_radius
 from torchrl_sspl.modules.agent import Agent, agent_directory, hosted
 from torchrl_sspl.sets import SAFE, UNSAFE
-from torchrl_sspl.trainers.episodes import Episodes, random_actions, run_episodes
+from torchrl_sspl.trainers.episodes import Act, Episodes, random_actions, run_episodes
 from torchrl_sspl.trainers.evaluation import encode_states, rollout
 
 CERTIFICATE_FILE = "certificate.json"
@@ -96,6 +97,7 @@ def certify_on_episodes(
     seed: int = 20260708,
     used_seeds: Sequence[int] = (),
     budget: Budget | None = None,
+    progress: bool = False,
 ) -> Certificate:
     r"""Certifies a frozen agent for an environment that is known only by being run.
 
@@ -115,6 +117,7 @@ def certify_on_episodes(
         seed: seed of the fresh episodes; must not have been used for anything else.
         used_seeds: seeds with which anything was trained, chosen or tuned.
         budget: of each search of the deterministic layer.
+        progress: show progress bars.
 
     Returns:
         The certificate.
@@ -131,10 +134,14 @@ def certify_on_episodes(
     certificate = _proved(agent, name, level, budget)
     env = make_env(batch_size=[envs], seed=seed)
     try:
-        random, level = random_actions(env, seed + 1), certificate.level
-        own = _until(lambda n: run_episodes(agent, env, n, horizon), episodes, lambda e: e.barrier[0] <= level)
-        seen = int(_shows_unsafe(own).sum())
-        chance = _until(lambda n: run_episodes(agent, env, n, horizon, random), episodes, _shows_unsafe, seen)
+        label, level = "certificate" if progress else None, certificate.level
+
+        def draw(n: int, act: Act | None = None) -> Episodes:
+            return run_episodes(agent, env, n, horizon, act, label=label)
+
+        own = _until(draw, episodes, lambda e: e.barrier[0] <= level)
+        at_random = partial(draw, act=random_actions(env, seed + 1))
+        chance = _until(at_random, episodes, _shows_unsafe, int(_shows_unsafe(own).sum()))
     finally:
         env.close()
     sample, conditions = _measure_episodes(hosted(agent), own, chance, certificate.level, seed, used_seeds)
@@ -258,7 +265,7 @@ def _measure_episodes(
         (barrier > level).any(0),
         lowest[shown.any(0)],
         both["latent"][both["alive"]],
-        len(error),
+        max(int(own.alive.sum(0).max()) - 1, 0),  # the environment may end them before
         seed,
         used_seeds=used_seeds,
         rims=_rims(error, barrier[:-1], level),

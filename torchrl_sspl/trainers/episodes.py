@@ -10,6 +10,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 from torchrl.envs import EnvBase
+from tqdm import tqdm
 
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules.agent import Agent
@@ -48,7 +49,9 @@ class Episodes:
 
 
 @torch.no_grad()
-def run_episodes(agent: Agent, env: EnvBase, n: int, horizon: int, act: Act | None = None) -> Episodes:
+def run_episodes(
+    agent: Agent, env: EnvBase, n: int, horizon: int, act: Act | None = None, *, label: str | None = None
+) -> Episodes:
     """Episodes from the environment's own resets.
 
     Args:
@@ -57,6 +60,7 @@ def run_episodes(agent: Agent, env: EnvBase, n: int, horizon: int, act: Act | No
         n: number of episodes, at most k of them at a time.
         horizon: steps per episode.
         act: latents ``(k, p)`` -> actions ``(k, m)``; by default the agent's policy.
+        label: title of a progress bar; none without.
 
     Returns:
         Latents, barrier values, labels and prediction errors.
@@ -68,6 +72,7 @@ def run_episodes(agent: Agent, env: EnvBase, n: int, horizon: int, act: Act | No
     parts: list[tuple[Tensor, ...]] = []
     film: list[Tensor] = []
     count = 0
+    bar = tqdm(total=n, desc=label, unit="episode", leave=False, disable=label is None)
     while count < n:
         data = env.reset()
         alive = torch.ones(env.batch_size[0], dtype=torch.bool)
@@ -102,6 +107,8 @@ def run_episodes(agent: Agent, env: EnvBase, n: int, horizon: int, act: Act | No
             errors = torch.cat([errors, errors[-1:].expand(missing, -1)])
         parts.append((*columns, errors))
         count += env.batch_size[0]
+        bar.update(env.batch_size[0])
+    bar.close()
     latents, barrier, region, kept, error = (torch.cat(c, 1)[:, :n] for c in zip(*parts, strict=True))
     return Episodes(latents, barrier, region, kept, error, torch.stack(film).cpu())
 
@@ -144,13 +151,16 @@ def separating_level(episodes: Sequence[Episodes], guard: float, reserve: float 
     return min(0.0, nearest - guard, max(-reserve, between))
 
 
-def evaluate_episodes(agent: Agent, make_env: MakeEnv, config: EpisodesConfig | None = None) -> Evaluation:
+def evaluate_episodes(
+    agent: Agent, make_env: MakeEnv, config: EpisodesConfig | None = None, *, progress: bool = False
+) -> Evaluation:
     r"""Measures a frozen agent on fresh episodes; each share counts independent episodes.
 
     Args:
         agent: frozen agent.
         make_env: ``(batch_size=[k], seed=...) -> environment`` with ``"pixels"`` and ``"region"``.
         config: sizes and seed.
+        progress: show progress bars.
 
     Returns:
         Shares of episodes with exact 95 % bounds, prediction errors, Lipschitz constants; what figures need is in
@@ -161,8 +171,9 @@ def evaluate_episodes(agent: Agent, make_env: MakeEnv, config: EpisodesConfig | 
     config = config or EpisodesConfig()
     env = make_env(batch_size=[config.envs], seed=config.seed)
     try:
-        own = run_episodes(agent, env, config.episodes, config.horizon)
-        chance = run_episodes(agent, env, config.episodes, config.horizon, random_actions(env, config.seed + 1))
+        label, random = "evaluation" if progress else None, random_actions(env, config.seed + 1)
+        own = run_episodes(agent, env, config.episodes, config.horizon, label=label)
+        chance = run_episodes(agent, env, config.episodes, config.horizon, random, label=label)
     finally:
         env.close()
     out = Evaluation()
@@ -182,7 +193,8 @@ def evaluate_episodes(agent: Agent, make_env: MakeEnv, config: EpisodesConfig | 
     touches = ((own.region == UNSAFE) & own.alive).any(0)
     starts = own.barrier[0] <= 0
     out.add(share("starts_inside", int(starts.sum()), len(starts), "resets with B <= 0"))
-    note = f"episodes of {config.horizon} steps from B <= 0 under the policy"
+    longest = int(own.alive.sum(0).max()) - 1  # the environment may end them before config.horizon
+    note = f"episodes of at most {longest} steps from B <= 0 under the policy"
     leaves = ((own.barrier > 0) & own.alive).any(0)
     out.add(share("touch_unsafe", int((touches & starts).sum()), int(starts.sum()), note))
     out.add(share("leave", int((leaves & starts).sum()), int(starts.sum()), note))

@@ -7,7 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,12 @@ from torchrl.trainers import LRSchedulerHook
 from tqdm import tqdm
 
 from torchrl_sspl.certification.branch_and_bound import Budget
-from torchrl_sspl.certification.certificate import Certificate
+from torchrl_sspl.certification.certificate import Certificate, Reason
 from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.data.collect import make_collector
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import SafetyEnv
-from torchrl_sspl.errors import ConfigError, EmptyRegionError, MissingDependencyError
+from torchrl_sspl.errors import CheckpointError, ConfigError, EmptyRegionError, MissingDependencyError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.modules.agent import Agent
@@ -35,6 +35,7 @@ from torchrl_sspl.objectives import SSPLLoss
 from torchrl_sspl.sets import UNLABELLED, UNSAFE
 from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, certify, certify_on_episodes
 from torchrl_sspl.trainers.config import LatentConfig, SynthesisConfig, TrainingConfig
+from torchrl_sspl.trainers.description import describe, differences
 from torchrl_sspl.trainers.encoding import encode_transitions
 from torchrl_sspl.trainers.episodes import evaluate_episodes, logged, random_actions, run_episodes, separating_level
 from torchrl_sspl.trainers.evaluation import Evaluation
@@ -51,6 +52,7 @@ SUMMARY = (
     ("starts_inside", "resets with B <= 0"),
     ("touch_unsafe", "episodes from B <= 0 that touch U, under the policy"),
     ("leave", "episodes from B <= 0 that leave it, under the policy"),
+    ("policy_touch_unsafe", "episodes that touch U, under the policy, wherever they start"),
     ("random_touch_unsafe", "episodes that touch U, under random actions"),
 )
 
@@ -130,6 +132,7 @@ class ExperimentOutcome:
         seconds: wall-clock time of the training, since it was resumed if it was.
         report: the page, or None where matplotlib is missing.
         warnings: what went wrong, and what to do about it.
+        advice: what to try where it is not certified.
     """
 
     directory: Path
@@ -139,6 +142,7 @@ class ExperimentOutcome:
     seconds: float
     report: Path | None
     warnings: list[str] = field(default_factory=list)
+    advice: list[str] = field(default_factory=list)
 
     def measured(self) -> list[str]:
         """The main measurements as sentences, with counts and exact 95 % bounds."""
@@ -154,7 +158,7 @@ class ExperimentOutcome:
         """The main measurements, the certificate's verdicts and warnings as text."""
         lines = self.measured()
         lines += [f"certificate, {layer.name} layer: {layer.verdict}" for layer in self.certificate.layers.values()]
-        return "\n".join([*lines, f"training: {self.seconds:.0f} s", *(f"warning: {text}" for text in self.warnings)])
+        return "\n".join([*lines, f"training: {self.seconds:.0f} s", *(f"warning: {text}" for text in self.warnings), *(f"to try: {text}" for text in self.advice)])
 
 
 class Experiment:
@@ -182,23 +186,36 @@ class Experiment:
         encoder: Callable[[int], nn.Module] | None = None,
         title: str = "Safe policy from pixels",
     ) -> None:
-        self.config, self.title = config.check(), title
+        config.check()
+        if make_env is not None:
+            _check_factory(make_env)
+            config = replace(config, env=describe(make_env))
+        self.config, self.title = config, title
         self.make_env = EnvFactory(config.env) if make_env is None else make_env
         self.directory = Path(config.out_dir)
         self.directory.mkdir(parents=True, exist_ok=True)
         self.device = usable_device(config.device)
-        env = self.make_env(batch_size=[1], seed=config.seed)
+        try:
+            env = self.make_env(batch_size=[1], seed=config.seed)
+        except TypeError as error:
+            raise ConfigError(
+                f"make_env: expected a function (batch_size=[n], seed=...) -> environment, such as partial(GymnasiumPixels, "
+                f"make, safe=..., unsafe=...), received one that raises TypeError: {error}"
+            ) from error
         missing = {"pixels", "region"} - set(env.observation_spec.keys())
         if missing:
             raise ConfigError(f"expected an environment with the keys pixels and region, found no {sorted(missing)}")
         space = env.action_spec_unbatched.space
         self._low, self._high = space.low.cpu().float(), space.high.cpu().float()
+        pixels = env.reset()["pixels"].cpu()
         env.close()
         torch.manual_seed(config.seed)
         scale = (self._high - self._low) / 2
         self._given = encoder or (resolve(config.network.encoder) if config.network.encoder else None)
         self._sizes = {"latent_dim": config.network.latent_dim, "action_dim": len(scale), "action_scale": scale.tolist()}
         self.encoder, self.dynamics, self.barrier, self.policy = self._networks()
+        if self._given is not None:
+            _check_encoder(self.encoder, pixels.to(self.device), config.network.latent_dim)
         self.description = self._describe()
         self.loss = self._loss(self.encoder, self.dynamics, self.barrier, self.policy)
         self.logger = make_logger(
@@ -214,7 +231,7 @@ class Experiment:
         if self._given is None:
             encoder: nn.Module = FrameEncoder(net.latent_dim, pool_to=net.pool_to, velocity_gain=net.velocity_gain)
         else:
-            encoder = self._given(net.latent_dim)
+            encoder = _called(self._given, net.latent_dim)
         dynamics = LatentDynamics(hidden=net.dynamics_hidden, **self._sizes)
         policy = Policy(hidden=net.policy_hidden, **self._sizes)
         barrier = SandwichBarrier(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
@@ -340,6 +357,7 @@ class Experiment:
         Source: paper, Algorithm 1.
         """
         began = time.monotonic()
+        self._claim(resume)
         if resume and self.trainer.checkpoint_rotation is not None:
             self.resumed = self.trainer.resume()
         if self.trainer.collected_frames < self.config.trainer.total_frames:
@@ -358,6 +376,20 @@ class Experiment:
         agent.save(self.directory / "agent")
         self.seconds = time.monotonic() - began
         return agent
+
+    def _claim(self, resume: bool) -> None:
+        """Writes down what the directory is for; one with checkpoints of something else is refused."""
+        file, now = self.directory / "config.json", json.loads(json.dumps(self.config.to_dict()))
+        rotation = self.trainer.checkpoint_rotation
+        if resume and rotation is not None and rotation.latest() is not None and file.is_file():
+            then = json.loads(file.read_text())
+            found = [d for key in ("env", "network") for d in differences(then.get(key), now[key], key)]
+            if found:
+                raise CheckpointError(
+                    f"expected the system and the networks of the run in '{self.directory}', received others ("
+                    f"{'; '.join(found[:5])}); use another out_dir, or delete the folder to start again"
+                )
+        file.write_text(json.dumps(now, indent=1) + "\n")
 
     def _synthesise(self, *, resume: bool) -> None:
         """Dynamics, policy and barrier once more, on latents that stand still: what moves under them no longer does."""
@@ -416,13 +448,13 @@ class Experiment:
         e = self.config.evaluation
         if not e.calibrate:
             return 0.0
-        seed = e.seed + 1000
+        seed, label = e.seed + 1000, "zero level" if self.config.trainer.progress else None
         env = self.make_env(batch_size=[e.envs], seed=seed)
         try:
             agent = self.agent().to(self.device)
             held_out = [
-                run_episodes(agent, env, e.episodes, e.horizon),
-                run_episodes(agent, env, e.episodes, e.horizon, random_actions(env, seed + 1)),
+                run_episodes(agent, env, e.episodes, e.horizon, label=label),
+                run_episodes(agent, env, e.episodes, e.horizon, random_actions(env, seed + 1), label=label),
             ]
         finally:
             env.close()
@@ -449,6 +481,7 @@ class Experiment:
                 seed=e.seed + 2000,
                 used_seeds=(self.config.seed, e.seed, e.seed + 1, e.seed + 1000, e.seed + 1001),
                 budget=budget,
+                progress=self.config.trainer.progress,
             )
         else:
             certificate = certify(agent, None, name=name, budget=budget)
@@ -466,12 +499,19 @@ class Experiment:
 
         Source: none.
         """
-        (self.directory / "config.json").write_text(json.dumps(self.config.to_dict(), indent=1) + "\n")
         agent = self.train(resume=resume)
         there = copy.deepcopy(agent).to(self.device)
-        evaluation = evaluate_episodes(there, self.make_env, self.config.evaluation)
+        evaluation = evaluate_episodes(
+            there, self.make_env, self.config.evaluation, progress=self.config.trainer.progress
+        )
         certificate = self._certificate(there)
         outcome = ExperimentOutcome(self.directory, agent, evaluation, certificate, self.seconds, None, self.warnings)
+        outcome.advice = advice(certificate, self.config)
+        policy, chance = (evaluation.measurements[f"{k}_touch_unsafe"] for k in ("policy", "random"))
+        if policy.lower is not None and chance.value is not None and policy.value > chance.value > 0.0:  # type: ignore[operator]
+            self.warnings.append(
+                f"over all episodes the policy touches U more often ({policy.value:.0%}) than random actions do ({chance.value:.0%})"
+            )
         body = {"seed": self.config.seed, "training_seconds": self.seconds, "measurements": evaluation.to_dict(),
                 "lipschitz": {k: v for k, v in agent.description["lipschitz"].items() if k != "multipliers"},
                 "config": self.config.to_dict()}  # fmt: skip
@@ -516,7 +556,94 @@ def run_experiment(
     """
     from torchrl_sspl.trainers.experiment_config import experiment_config
 
-    return Experiment(experiment_config(overrides, **defaults), make_env, encoder=encoder, title=title).run()
+    config = experiment_config(overrides, **defaults)
+    ignored = sorted({k.partition("=")[0] for k in (*overrides, *defaults) if k.partition("=")[0].split(".")[0] == "env"})
+    if ignored:
+        raise ConfigError(
+            f"expected no setting of env where the environment is given in code, received {', '.join(ignored)}; set it there, "
+            "for example in partial(GymnasiumPixels, ..., image_size=64)"
+        )
+    return Experiment(config, make_env, encoder=encoder, title=title).run()
+
+
+def advice(certificate: Certificate, config: ExperimentConfig) -> list[str]:
+    """What to try where an own system is not certified, the likeliest first.
+
+    Args:
+        certificate: of the run.
+        config: of the run.
+
+    Returns:
+        Sentences without a full stop; none where both layers hold.
+
+    Source: none.
+    """
+    layers = [certificate.layers[k] for k in ("deterministic", "statistical") if k in certificate.layers]
+    reasons = {reason for layer in layers for reason in layer.reasons}
+    net, e = config.network, config.evaluation
+    lines = []
+    if reasons & {Reason.NOT_INVARIANT, Reason.MARGIN_TOO_SMALL, Reason.EPISODES_LEAVE}:
+        lines.append(
+            "the set is led out of by what encoder and latent dynamics miss: as many latent numbers as the state has and the "
+            f"policy needs (network.latent_dim, now {net.latent_dim}), pictures in which a step moves more (action_repeat, a "
+            f"closer camera; the default encoder averages them to network.pool_to = {net.pool_to} pixels), more data "
+            f"(trainer.total_frames, now {config.trainer.total_frames}), a U that can still be avoided from outside"
+        )
+    if Reason.UNSAFE_INSIDE in reasons:
+        lines.append("observations of U that look like S: more data in U (reset_options), finer pictures (image_size, network.pool_to)")
+    if Reason.TOO_FEW in reasons or Reason.NOT_MEASURED in reasons:
+        lines.append(
+            "too few fresh episodes start in the set, or show U: resets that do (reset_options), or more of them "
+            f"(evaluation.certificate_episodes, now {e.certificate_episodes})"
+        )
+    if reasons & {Reason.UNDECIDED, Reason.VACUITY_UNDECIDED}:
+        lines.append(f"the proof ran out of time: more of it (evaluation.certificate_seconds, now {e.certificate_seconds:g})")
+    return lines
+
+
+def _check_factory(make_env: Any) -> None:
+    if isinstance(make_env, EnvBase) or not callable(make_env):
+        raise ConfigError(
+            "make_env: expected a function (batch_size=[n], seed=...) -> environment, such as partial(GymnasiumPixels, make, "
+            f"safe=..., unsafe=...), received an object of type {type(make_env).__name__}"
+        )
+
+
+def _called(encoder: Any, latent_dim: int) -> nn.Module:
+    """The encoder that a class or a function makes."""
+    expected = "encoder: expected a class or a function latent_dim -> module, received"
+    if isinstance(encoder, nn.Module):
+        raise ConfigError(f"{expected} a module; give its class, {type(encoder).__name__}")
+    try:
+        made: nn.Module = encoder(latent_dim)
+    except TypeError as error:
+        raise ConfigError(f"{expected} one that raises TypeError: {error}") from error
+    return made
+
+
+@torch.no_grad()
+def _check_encoder(encoder: nn.Module, pixels: Tensor, latent_dim: int) -> None:
+    """One look at what an encoder makes of an observation, before anything is trained."""
+    mode, shape = encoder.training, tuple(pixels.shape)
+    encoder.eval()
+    try:
+        latent = encoder(pixels)
+    except Exception as error:
+        raise ConfigError(
+            f"encoder: expected a module that takes uint8 pixels of shape {shape}, received {type(error).__name__}: {error}; "
+            "it begins with pixels.float() / 255"
+        ) from error
+    finally:
+        encoder.train(mode)
+    if latent.shape != (len(pixels), latent_dim) or not latent.is_floating_point():
+        raise ConfigError(
+            f"encoder: expected latents of shape (*batch, network.latent_dim={latent_dim}), received {tuple(latent.shape)} of "
+            f"{latent.dtype}; the class gets latent_dim"
+        )
+    if not float(latent.abs().max()) <= 1.0 + 1e-6:
+        raise ConfigError(
+            f"encoder: expected latents in [-1, 1], received up to {float(latent.abs().max()):.3g}; end it with nn.Tanh()"
+        )
 
 
 def _cosine(steps: int, step: int) -> float:

@@ -6,7 +6,7 @@ import dataclasses
 import importlib
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -434,6 +434,10 @@ def experiment_config(overrides: Sequence[str] = (), **defaults: Any) -> Experim
         >>> experiment_config(["trainer.total_frames=2000", "collector.envs=4"]).trainer.total_frames
         2000
     """
+    if isinstance(overrides, (str, Mapping)):
+        raise ConfigError(
+            f"overrides: expected a list of key=value strings such as ['seed=1'], received a {type(overrides).__name__}"
+        )
     config = ExperimentConfig()
     values = dict(defaults)
     for item in overrides:

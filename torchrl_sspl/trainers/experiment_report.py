@@ -103,6 +103,7 @@ def write(experiment: Experiment, outcome: ExperimentOutcome, figures: dict[str,
     film.write_bytes(encode_gif(frames.repeat_interleave(larger, -1).repeat_interleave(larger, -2)))
     notes = [
         *(f"Warning: {text}." for text in outcome.warnings),
+        *(f"To try: {text}." for text in outcome.advice),
         f"Training took {outcome.seconds:.0f} s{' since it was resumed' if experiment.resumed else ''}.",
         "No model of the environment is known: every figure counts fresh episodes from its own resets. Nothing is said "
         "about states that these do not reach.",
