@@ -15,7 +15,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import Budget
-from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, differences
+from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, Statement, differences
 from torchrl_sspl.certification.layers import (
     Sample,
     deterministic_layer,
@@ -396,7 +396,30 @@ def test_an_empty_set_is_not_searched_for_ever(monkeypatch):
         return draw(agent, env, state)
 
     monkeypatch.setattr(certify_module, "encode_states", counted)
-    certificate = certify(agent, env, level=0.0, episodes=5, horizon=2, budget=Budget(seconds=5.0))
+    certificate = certify(agent, env, level=0.0, episodes=5, horizon=2, budget=Budget(seconds=300.0))
     assert seen == [10] * 10 + [5, 5, 20]  # the search, U, S, the reference
     assert Reason.EMPTY in certificate.layers["deterministic"].reasons
     assert not certificate.layers["statistical"].holds
+
+
+def test_a_search_with_more_time_may_find_more(issued):
+    claimed = Certificate.load(issued / "certificate.json")
+    full = claimed.layers["deterministic"]
+
+    def found(change: Callable[[list[Statement]], list[Statement]]) -> dict[Reason, str]:
+        less = Certificate.load(issued / "certificate.json")
+        less.layers["deterministic"].statements = change(list(full.statements))
+        return differences(less, claimed)
+
+    def with_(name: str, **values: Any) -> Callable[[list[Statement]], list[Statement]]:
+        return lambda rows: [replace(s, **values) if s.name == name else s for s in rows]
+
+    assert found(with_("tolerated error", value=-math.inf, holds=False, reason="MARGIN_TOO_SMALL", misses_by=math.inf)) == {}
+    assert found(with_("tolerated error", value=0.5 * full["tolerated error"].value)) == {}
+    assert Reason.NUMBERS_CHANGED in found(with_("tolerated error", value=2.0 * full["tolerated error"].value))
+    undecided = {"holds": False, "reason": "UNDECIDED", "misses_by": None}
+    rest = [s for s in full.statements if s.name != "tolerated error"]
+    assert found(lambda rows: with_("invariance", **undecided)(rest)) == {}
+    assert Reason.NUMBERS_CHANGED in found(lambda rows: rest)
+    refuted = {"holds": False, "reason": "NOT_INVARIANT", "misses_by": 0.1}
+    assert Reason.NUMBERS_CHANGED in found(with_("invariance", **refuted))

@@ -83,4 +83,5 @@ def _row(statement: Statement) -> list[str]:
         status = badge(f"not {s.kind}{miss}" if s.kind == PROVED else f"does not hold{miss}")
     value = "" if s.value is None else format_value(s.value, s.unit)
     size = "" if s.n is None else f"{s.n:,}" + ("" if s.confidence is None else f", {100 * s.confidence:g} %")
-    return [escape(s.text), status, escape(value), escape(size), escape(s.detail)]
+    where = f" ({s.name.removeprefix('error ')})" if s.name.startswith("error ") else ""  # their texts are the same
+    return [escape(s.text + where), status, escape(value), escape(size), escape(s.detail)]
