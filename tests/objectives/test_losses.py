@@ -460,3 +460,10 @@ def test_lipschitz_loss_refuses_to_go_on_outside_the_cone() -> None:
 def test_sandwich_barriers_need_no_lipschitz_loss() -> None:
     with pytest.raises(ConfigError, match="by construction"):
         LipschitzLoss(SandwichBarrier(2, (8,)))
+
+
+def test_dynamics_and_policy_in_other_units_are_refused() -> None:
+    salad = SaLaD.from_sizes(latent_dim=3, action_dim=1, action_scale=10.0)
+    SSPLLoss(*salad, Policy(3, 1, action_scale=10.0))
+    with pytest.raises(ConfigError, match=r"one action_scale .* received \[10.0\] and \[1.0\]"):
+        SSPLLoss(*salad, Policy(3, 1, action_scale=1.0))

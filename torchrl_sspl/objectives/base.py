@@ -189,6 +189,12 @@ class LatentLoss(LossModule):
             safety_margin=safety_margin, dynamics_margin=dynamics_margin, worst_coeff=worst_coeff
         )
         self.worst_fraction = float(worst_fraction)
+        scales = [getattr(getattr(m, "module", m), "action_scale", None) for m in (dynamics, policy)]
+        if all(isinstance(s, Tensor) for s in scales) and not torch.equal(*scales):  # type: ignore[arg-type]
+            raise ConfigError(
+                f"expected one action_scale in dynamics and policy, received {scales[0].tolist()} and "  # type: ignore[union-attr]
+                f"{scales[1].tolist()}; give both the largest action in physical units"  # type: ignore[union-attr]
+            )
         keys = self.tensor_keys
         if encoder is not None:
             self._add("encoder", encoder, [keys.observation], [keys.latent], delayed)
