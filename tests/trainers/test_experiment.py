@@ -26,8 +26,9 @@ from torchrl_sspl.trainers import certify as certify_module
 from torchrl_sspl.trainers import certify_on_episodes
 from torchrl_sspl.trainers.description import describe, differences
 from torchrl_sspl.trainers.episodes import Episodes, evaluate_episodes, run_episodes, separating_level
-from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy, advice, run_experiment
+from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy, run_experiment
 from torchrl_sspl.trainers.experiment_config import EpisodesConfig, experiment_config
+from torchrl_sspl.trainers.guidance import advice
 from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.latents import LatentTraining
 from torchrl_sspl.trainers.stepper import SSPLStepper

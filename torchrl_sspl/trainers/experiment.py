@@ -22,7 +22,7 @@ from torchrl.trainers import LRSchedulerHook
 from tqdm import tqdm
 
 from torchrl_sspl.certification.branch_and_bound import Budget
-from torchrl_sspl.certification.certificate import Certificate, Reason
+from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.data.collect import make_collector
 from torchrl_sspl.devices import usable_device
@@ -40,6 +40,7 @@ from torchrl_sspl.trainers.encoding import encode_transitions
 from torchrl_sspl.trainers.episodes import evaluate_episodes, logged, random_actions, run_episodes, separating_level
 from torchrl_sspl.trainers.evaluation import Evaluation
 from torchrl_sspl.trainers.experiment_config import EnvFactory, ExperimentConfig, resolve
+from torchrl_sspl.trainers.guidance import advice, check_encoder, check_factory, make_encoder
 from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.latents import LatentTraining
 from torchrl_sspl.trainers.loggers import close_logger, log_figure, log_scalars, log_video, make_logger
@@ -158,7 +159,9 @@ class ExperimentOutcome:
         """The main measurements, the certificate's verdicts and warnings as text."""
         lines = self.measured()
         lines += [f"certificate, {layer.name} layer: {layer.verdict}" for layer in self.certificate.layers.values()]
-        return "\n".join([*lines, f"training: {self.seconds:.0f} s", *(f"warning: {text}" for text in self.warnings), *(f"to try: {text}" for text in self.advice)])
+        lines.append(f"training: {self.seconds:.0f} s")
+        lines += [f"warning: {text}" for text in self.warnings] + [f"to try: {text}" for text in self.advice]
+        return "\n".join(lines)
 
 
 class Experiment:
@@ -188,7 +191,7 @@ class Experiment:
     ) -> None:
         config.check()
         if make_env is not None:
-            _check_factory(make_env)
+            check_factory(make_env)
             config = replace(config, env=describe(make_env))
         self.config, self.title = config, title
         self.make_env = EnvFactory(config.env) if make_env is None else make_env
@@ -215,7 +218,7 @@ class Experiment:
         self._sizes = {"latent_dim": config.network.latent_dim, "action_dim": len(scale), "action_scale": scale.tolist()}
         self.encoder, self.dynamics, self.barrier, self.policy = self._networks()
         if self._given is not None:
-            _check_encoder(self.encoder, pixels.to(self.device), config.network.latent_dim)
+            check_encoder(self.encoder, pixels.to(self.device), config.network.latent_dim)
         self.description = self._describe()
         self.loss = self._loss(self.encoder, self.dynamics, self.barrier, self.policy)
         self.logger = make_logger(
@@ -231,7 +234,7 @@ class Experiment:
         if self._given is None:
             encoder: nn.Module = FrameEncoder(net.latent_dim, pool_to=net.pool_to, velocity_gain=net.velocity_gain)
         else:
-            encoder = _called(self._given, net.latent_dim)
+            encoder = make_encoder(self._given, net.latent_dim)
         dynamics = LatentDynamics(hidden=net.dynamics_hidden, **self._sizes)
         policy = Policy(hidden=net.policy_hidden, **self._sizes)
         barrier = SandwichBarrier(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
@@ -564,86 +567,6 @@ def run_experiment(
             "for example in partial(GymnasiumPixels, ..., image_size=64)"
         )
     return Experiment(config, make_env, encoder=encoder, title=title).run()
-
-
-def advice(certificate: Certificate, config: ExperimentConfig) -> list[str]:
-    """What to try where an own system is not certified, the likeliest first.
-
-    Args:
-        certificate: of the run.
-        config: of the run.
-
-    Returns:
-        Sentences without a full stop; none where both layers hold.
-
-    Source: none.
-    """
-    layers = [certificate.layers[k] for k in ("deterministic", "statistical") if k in certificate.layers]
-    reasons = {reason for layer in layers for reason in layer.reasons}
-    net, e = config.network, config.evaluation
-    lines = []
-    if reasons & {Reason.NOT_INVARIANT, Reason.MARGIN_TOO_SMALL, Reason.EPISODES_LEAVE}:
-        lines.append(
-            "the set is led out of by what encoder and latent dynamics miss: as many latent numbers as the state has and the "
-            f"policy needs (network.latent_dim, now {net.latent_dim}), pictures in which a step moves more (action_repeat, a "
-            f"closer camera; the default encoder averages them to network.pool_to = {net.pool_to} pixels), more data "
-            f"(trainer.total_frames, now {config.trainer.total_frames}), a U that can still be avoided from outside"
-        )
-    if Reason.UNSAFE_INSIDE in reasons:
-        lines.append("observations of U that look like S: more data in U (reset_options), finer pictures (image_size, network.pool_to)")
-    if Reason.TOO_FEW in reasons or Reason.NOT_MEASURED in reasons:
-        lines.append(
-            "too few fresh episodes start in the set, or show U: resets that do (reset_options), or more of them "
-            f"(evaluation.certificate_episodes, now {e.certificate_episodes})"
-        )
-    if reasons & {Reason.UNDECIDED, Reason.VACUITY_UNDECIDED}:
-        lines.append(f"the proof ran out of time: more of it (evaluation.certificate_seconds, now {e.certificate_seconds:g})")
-    return lines
-
-
-def _check_factory(make_env: Any) -> None:
-    if isinstance(make_env, EnvBase) or not callable(make_env):
-        raise ConfigError(
-            "make_env: expected a function (batch_size=[n], seed=...) -> environment, such as partial(GymnasiumPixels, make, "
-            f"safe=..., unsafe=...), received an object of type {type(make_env).__name__}"
-        )
-
-
-def _called(encoder: Any, latent_dim: int) -> nn.Module:
-    """The encoder that a class or a function makes."""
-    expected = "encoder: expected a class or a function latent_dim -> module, received"
-    if isinstance(encoder, nn.Module):
-        raise ConfigError(f"{expected} a module; give its class, {type(encoder).__name__}")
-    try:
-        made: nn.Module = encoder(latent_dim)
-    except TypeError as error:
-        raise ConfigError(f"{expected} one that raises TypeError: {error}") from error
-    return made
-
-
-@torch.no_grad()
-def _check_encoder(encoder: nn.Module, pixels: Tensor, latent_dim: int) -> None:
-    """One look at what an encoder makes of an observation, before anything is trained."""
-    mode, shape = encoder.training, tuple(pixels.shape)
-    encoder.eval()
-    try:
-        latent = encoder(pixels)
-    except Exception as error:
-        raise ConfigError(
-            f"encoder: expected a module that takes uint8 pixels of shape {shape}, received {type(error).__name__}: {error}; "
-            "it begins with pixels.float() / 255"
-        ) from error
-    finally:
-        encoder.train(mode)
-    if latent.shape != (len(pixels), latent_dim) or not latent.is_floating_point():
-        raise ConfigError(
-            f"encoder: expected latents of shape (*batch, network.latent_dim={latent_dim}), received {tuple(latent.shape)} of "
-            f"{latent.dtype}; the class gets latent_dim"
-        )
-    if not float(latent.abs().max()) <= 1.0 + 1e-6:
-        raise ConfigError(
-            f"encoder: expected latents in [-1, 1], received up to {float(latent.abs().max()):.3g}; end it with nn.Tanh()"
-        )
 
 
 def _cosine(steps: int, step: int) -> float:
