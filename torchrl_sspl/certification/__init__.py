@@ -1,4 +1,4 @@
-"""What can be said about frozen networks: proofs on the latent domain, measurements with confidence, true kernels."""
+"""What can be said about frozen networks: proofs on the latent domain, measurements with confidence."""
 
 from __future__ import annotations
 
@@ -14,20 +14,20 @@ from torchrl_sspl.certification.conditions import (
     largest_error,
     search_level,
 )
-from torchrl_sspl.certification.ground_truth import ViabilityKernel, recoverable_set, viability_kernel
-from torchrl_sspl.certification.layers import Sample, deterministic_layer, paper_layer, statistical_layer
-from torchrl_sspl.certification.statistics import clopper_pearson
+from torchrl_sspl.certification.layers import deterministic_layer
+from torchrl_sspl.certification.record import Counts, Record
+from torchrl_sspl.certification.statistics import clopper_pearson, paper_layer, statistical_layer
 
 __all__ = [
     "Budget",
     "Certificate",
     "ClosedLoop",
+    "Counts",
     "Layer",
     "Outcome",
     "Reason",
-    "Sample",
+    "Record",
     "Statement",
-    "ViabilityKernel",
     "clopper_pearson",
     "closed_loop",
     "decide_domain",
@@ -37,8 +37,6 @@ __all__ = [
     "find_counterexamples",
     "largest_error",
     "paper_layer",
-    "recoverable_set",
     "search_level",
     "statistical_layer",
-    "viability_kernel",
 ]

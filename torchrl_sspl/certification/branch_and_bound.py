@@ -18,6 +18,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor
@@ -28,8 +29,9 @@ from torchrl_sspl.certification.half_spaces import clip, programme
 from torchrl_sspl.certification.propagation import Enclosure, LinearBound
 from torchrl_sspl.errors import ConfigError
 
-#: What a bound must be better by before it decides; far above the rounding of float64.
+#: What a bound or a witness must be better by before it decides; far above the rounding of float64.
 SLACK = 1e-6
+
 
 @dataclass(frozen=True)
 class Budget:
@@ -100,12 +102,12 @@ class Problem:
         return parts.amin(1) if self.combine == "min" else parts.amax(1)
 
     def feasible(self, barrier: Tensor) -> Tensor:
-        """Whether points with these barrier values ``(n,)`` count."""
+        """Whether points with these barrier values ``(n,)`` count, whatever float64 rounded off."""
         inside = torch.ones_like(barrier, dtype=torch.bool)
         if self.level is not None:
-            inside &= barrier <= self.level
+            inside &= barrier <= self.level - SLACK
         if self.floor is not None:
-            inside &= barrier >= self.floor
+            inside &= barrier >= self.floor + SLACK
         return inside
 
 
@@ -286,7 +288,6 @@ def _bound(
     first = torch.full((len(low), len(q.rows)), math.inf, dtype=low.dtype)
     if q.inner is not None and q.lipschitz is not None:
         least, most = inner.interval(q.inner)
-        least, most = least.clamp_min(-1.0), most.clamp_max(1.0)
         reach = q.lipschitz * (0.5 * (most - least)).norm(dim=1)
         first = (q.barrier(0.5 * (least + most)) + reach[:, None]) @ q.rows.mT + q.constant
         if below is not None and bool(q.barrier_weight.any()):
@@ -332,11 +333,12 @@ def maximise(
     tight: bool = False,
     confirm: Callable[[Tensor], bool] | None = None,
     progress: bool = False,
+    seek: bool = True,
 ) -> Outcome:
     """Largest objective where the constraint holds, or a proof that it does not exceed a threshold.
 
-    With a threshold the search ends as soon as that is proved or refuted. Without one it closes in on the maximum from
-    both sides until they are no more than the tolerance apart.
+    With a threshold the search ends as soon as that is proved or refuted; a maximum that lies within the slack of it is
+    neither. Without one it closes in on the maximum from both sides until they are no more than the tolerance apart.
 
     Args:
         problem: what is maximised.
@@ -344,13 +346,14 @@ def maximise(
         stop_above: end, "refuted", as soon as a value above this is found (without a threshold).
         tolerance: largest distance of the two sides in the end (without a threshold).
         budget: when to give up.
-        slack: what a bound must be better by before it decides.
+        slack: what a bound or a witness must be better by before it decides.
         batch: boxes at a time.
         seed: of the samples.
         tight: backward bounds for all undecided activations.
         confirm: whether a point ``(p,)`` is a counterexample for the networks as they are deployed too; a point that is
             none does not refute.
         progress: show a progress bar.
+        seek: look for points with a large objective; without it nothing is refuted, and the bounds have to do it alone.
 
     Returns:
         The outcome; the same for the same arguments unless the time runs out.
@@ -366,46 +369,88 @@ def maximise(
         >>> outcome.status, abs(outcome.upper - 0.5) < 2e-3
         ('proved', True)
     """
-    start, budget = time.monotonic(), budget or Budget()
-    left = _Boxes(problem.low, problem.high)
-    lower, witness = attack(problem, seed=seed)
-    goal = lower + tolerance if threshold is None else threshold
-    count = deepest = 0
-
-    def outcome(status: str) -> Outcome:
-        upper = max(goal, float(left.upper.max())) if len(left) else goal
-        return Outcome(status, upper, lower, witness, count, time.monotonic() - start, left.volume(), deepest)
-
-    def refuted() -> bool:
-        limit = stop_above if threshold is None else threshold
-        return lower > limit and witness is not None and (confirm is None or confirm(witness))
-
+    budget = budget or Budget()
+    search = _Search(problem, threshold, stop_above, tolerance, slack, confirm, seek)
+    search.lower, search.witness = attack(problem, seed=seed) if seek else (-math.inf, None)
     bar = tqdm(total=1.0, disable=not progress, bar_format="{l_bar}{bar}| {n:.4f} of the domain [{elapsed}<{remaining}]")
     with bar:
-        if refuted():
-            return outcome("refuted")
-        while len(left):
-            if count >= budget.boxes or time.monotonic() - start >= budget.seconds:
-                return outcome("undecided")
-            low, high, depth = left.take(min(batch, budget.boxes - count))
-            count += len(low)
-            low, high, upper, sensitivity, kept = _bound(problem, low, high, goal, slack, tight)
-            if len(low):
-                center = 0.5 * (low + high)
-                value, barrier = problem.evaluate(center)
-                value = torch.where(problem.feasible(barrier), value, -math.inf)
-                if float(value.max()) > lower:
-                    lower, witness = float(value.max()), center[int(value.argmax())].clone()
-                    better, place = ascend(problem, center[value.topk(min(32, len(value))).indices], steps=20)
-                    if better > lower:
-                        lower, witness = better, place
-                    goal = max(goal, lower + tolerance) if threshold is None else threshold
-                    if refuted():
-                        left.split(low, high, upper, depth[kept], sensitivity)
-                        return outcome("refuted")
-                left.split(low, high, upper, depth[kept], sensitivity)
-                deepest = max(deepest, int(depth[kept].max()) + 1)
+        if search.refuted():
+            return search.outcome("refuted")
+        while len(search.left):
+            if search.count >= budget.boxes or search.seconds() >= budget.seconds:
+                return search.outcome("undecided")
+            if search.advance(min(batch, budget.boxes - search.count), tight):
+                return search.outcome("refuted")
             if progress:
-                bar.n = max(0.0, 1.0 - left.volume())
+                bar.n = max(0.0, 1.0 - search.left.volume())
                 bar.refresh()
-    return outcome("proved")
+    return search.outcome("undecided" if search.close else "proved")
+
+
+class _Search:
+    """Where a search stands; the arguments are those of :func:`maximise`."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        threshold: float | None,
+        stop_above: float,
+        tolerance: float,
+        slack: float,
+        confirm: Callable[[Tensor], bool] | None,
+        seek: bool,
+    ) -> None:
+        self.problem, self.threshold, self.tolerance = problem, threshold, tolerance
+        self.slack, self.confirm, self.seek = slack, confirm, seek
+        self.limit = stop_above if threshold is None else threshold + slack
+        self.start = time.monotonic()
+        self.left = _Boxes(problem.low, problem.high)
+        self.lower, self.witness = -math.inf, cast("Tensor | None", None)
+        self.count = self.deepest = 0
+        self.close: list[float] = []  # volumes of the boxes on which the maximum lies within the slack of the threshold
+
+    @property
+    def goal(self) -> float:
+        """What the objective is to be proved to be at most."""
+        return self.lower + self.tolerance if self.threshold is None else self.threshold
+
+    def seconds(self) -> float:
+        return time.monotonic() - self.start
+
+    def refuted(self) -> bool:
+        witness = self.witness
+        return self.lower > self.limit and witness is not None and (self.confirm is None or self.confirm(witness))
+
+    def outcome(self, status: str) -> Outcome:
+        upper, volume = self.goal + (self.slack if self.close else 0.0), self.left.volume() + sum(self.close)
+        if len(self.left):
+            upper = max(upper, float(self.left.upper.max()) + self.slack)
+        return Outcome(status, upper, self.lower, self.witness, self.count, self.seconds(), volume, self.deepest)
+
+    def advance(self, n: int, tight: bool) -> bool:
+        """Bounds the n boxes with the highest bounds and splits what is left of them; whether that refuted."""
+        low, high, depth = self.left.take(n)
+        self.count += len(low)
+        low, high, upper, sensitivity, kept = _bound(self.problem, low, high, self.goal, self.slack, tight)
+        rest: tuple[Tensor, ...] = (low, high, upper, depth[kept], sensitivity)
+        if len(low) and self.seek:
+            value = self.look(0.5 * (low + high))
+            if self.threshold is not None and not self.refuted():  # neither side can decide here, however often it is cut
+                stuck = (upper <= self.threshold + self.slack) & (value > self.threshold - self.slack)
+                self.close += ((high - low)[stuck].prod(1) / self.left.domain).tolist()
+                rest = tuple(t[~stuck] for t in rest)
+        if len(rest[0]):
+            self.left.split(*rest)
+            self.deepest = max(self.deepest, int(rest[3].max()) + 1)
+        return self.refuted()
+
+    def look(self, center: Tensor) -> Tensor:
+        """Objective at these points, -inf where the constraint fails; ascends from the best if one is better than all before."""
+        value, barrier = self.problem.evaluate(center)
+        value = torch.where(self.problem.feasible(barrier), value, -math.inf)
+        if float(value.max()) > self.lower:
+            self.lower, self.witness = float(value.max()), center[int(value.argmax())].clone()
+            better, place = ascend(self.problem, center[value.topk(min(32, len(value))).indices], steps=20)
+            if better > self.lower:
+                self.lower, self.witness = better, place
+        return value

@@ -14,14 +14,16 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from torchrl_sspl.certification.activations import Activation, clamp
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, Outcome, Problem, maximise
+from torchrl_sspl.certification.floating import largest_rounding, rounding_bound
 from torchrl_sspl.certification.graph import Apply, Graph
-from torchrl_sspl.certification.propagation import rounding_bound
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, StructureError
 from torchrl_sspl.lipschitz import lipschitz_upper
+from torchrl_sspl.lipschitz.layers import FORMS, Activation, clamp
+from torchrl_sspl.lipschitz.network import check_module, flat_layers
 
 CONDITIONS = ("R3", "R1", "R2")
+_SCALES = (1e-10, 1e10)
 
 
 @dataclass(frozen=True)
@@ -96,11 +98,16 @@ def closed_loop(
     .. math:: u = s \operatorname{clamp}(\operatorname{net}_\pi(z), -1, 1), \qquad
         z^+ = \operatorname{clamp}(z + \operatorname{net}_d(z, u / s), -1, 1)
 
+    Modules are known by their exact types (:mod:`torchrl_sspl.lipschitz.layers`), and whatever might stand between their
+    weights and what they compute is refused.
+
     Args:
-        barrier: ``nn.Sequential`` of linear layers and activations (or a module with ``collapse()``), p inputs, 1 output.
-        dynamics: module in the form above, with ``net`` and ``action_scale``; or a plain ``nn.Sequential`` of
-            ``(z, u)``, p + m inputs and p outputs, taken as it is.
-        policy: module in the form above; or a plain ``nn.Sequential``, p inputs and m outputs.
+        barrier: ``nn.Sequential`` of linear layers and activations (or a barrier of the library with ``collapse()``),
+            p inputs, 1 output.
+        dynamics: module in the form above (``modules.LatentDynamics``); or a plain ``nn.Sequential`` of ``(z, u)``,
+            p + m inputs and p outputs, taken as it is. Either takes the action in physical units.
+        policy: module in the form above (``modules.Policy``); or a plain ``nn.Sequential``, p inputs and m outputs. Either
+            gives the action in physical units.
         latent_dim: p.
         lipschitz_bound: proved Lipschitz constant of the barrier (``math.inf`` where none is known).
         low: lower corner of the domain, a number or ``(p,)``.
@@ -110,7 +117,9 @@ def closed_loop(
         The closed loop.
 
     Raises:
-        ConfigError: if a module is of neither form, the action scales differ, or the domain is empty.
+        StructureError: if a module is of neither form or may compute something else than it says, or the action scales
+            differ, are not positive or not finite.
+        ConfigError: if the domain is empty.
         ShapeError: if the networks do not fit each other.
         NonFiniteError: if a weight is NaN or infinite.
 
@@ -127,17 +136,12 @@ def closed_loop(
         [[0.5, 0.5]]
     """
     corners = [torch.as_tensor(c, dtype=torch.float64).cpu().expand(latent_dim).clone() for c in (low, high)]
-    if not bool((corners[0] < corners[1]).all()):
-        raise ConfigError(f"expected low < high in every dimension, received {corners[0].tolist()}, {corners[1].tolist()}")
+    if not bool((corners[0] < corners[1]).all()) or not all(bool(c.isfinite().all()) for c in corners):
+        raise ConfigError(f"expected finite low < high in every dimension, received {corners[0].tolist()}, {corners[1].tolist()}")
     if not lipschitz_bound > 0:
         raise ConfigError(f"expected a positive Lipschitz bound of the barrier, received {lipschitz_bound}")
-    scales = [getattr(m, "action_scale", None) for m in (dynamics, policy)]
-    if all(s is not None for s in scales) and not torch.equal(*scales):  # type: ignore[arg-type]
-        raise ConfigError(f"expected one action scale in dynamics and policy, received {scales[0]} and {scales[1]}")
-
     def append_step(graph: Graph) -> int:
-        action = _append_policy(graph, policy)
-        return _append_dynamics(graph, dynamics, action)
+        return _append_dynamics(graph, dynamics, *_append_policy(graph, policy))
 
     alone, step, looped = Graph(latent_dim), Graph(latent_dim), Graph(latent_dim)
     alone.network(0, barrier)
@@ -152,41 +156,66 @@ def closed_loop(
     return ClosedLoop(alone, step, looped, inner, float(lipschitz_bound), *corners)
 
 
-def _append_policy(graph: Graph, policy: nn.Module) -> int:
-    """Appends the policy; the result is the action in units of the dynamics' network."""
-    if isinstance(policy, nn.Sequential):
-        return graph.interface(graph.network(0, policy))
-    net = _net(policy, "policy")
-    return graph.interface(graph.apply(graph.network(0, net), clamp()))
+def _append_policy(graph: Graph, policy: nn.Module) -> tuple[int, Tensor | None]:
+    """Appends the policy; the result times the scale (where there is one) is the action in physical units."""
+    net, scale = _taken_apart(policy, "policy", "bounded")
+    if scale is None:
+        return graph.interface(graph.layers(0, net)), None
+    action = graph.interface(graph.apply(graph.layers(0, net), clamp()))
+    return action, _checked_scale(scale, graph.sizes[action])
 
 
-def _append_dynamics(graph: Graph, dynamics: nn.Module, action: int) -> int:
-    plain = isinstance(dynamics, nn.Sequential)
-    net = cast(nn.Sequential, dynamics if plain else _net(dynamics, "dynamics"))
-    p = graph.input_dim
-    layers = list(net)
-    first = layers[0]
-    if type(first) is not nn.Linear:
-        raise ConfigError(f"expected the dynamics to start with a linear layer, received {type(first).__name__}")
-    hidden = graph.linear([0, action], [first.weight[:, :p], first.weight[:, p:]], first.bias)
-    if plain:
-        return graph.interface(graph.network(hidden, nn.Sequential(*layers[1:])))
-    last = layers[-1]
-    if len(layers) == 1 or type(last) is not nn.Linear:
-        raise ConfigError("expected the dynamics' network to start and end with different linear layers")
-    hidden = graph.network(hidden, nn.Sequential(*layers[1:-1]))
-    moved = graph.linear([0, hidden], [torch.eye(p), last.weight], last.bias)
+def _append_dynamics(graph: Graph, dynamics: nn.Module, action: int, scale: Tensor | None) -> int:
+    """Appends the dynamics, whose action is a step times the policy's scale."""
+    layers, own = _taken_apart(dynamics, "dynamics", "residual")
+    p, m = graph.input_dim, graph.sizes[action]
+    own = None if own is None else _checked_scale(own, m)
+    if scale is not None and own is not None and not torch.equal(scale, own):
+        raise StructureError(f"expected one action scale in dynamics and policy, received {scale.tolist()} and {own.tolist()}")
+    if (scale is None) != (own is None):  # each module has its own unit: what is deployed multiplies or divides
+        factor = scale if own is None else 1.0 / cast(Tensor, own)
+        action = graph.interface(graph.linear([action], [torch.diag(cast(Tensor, factor))], roundings=2))
+    if not layers or not isinstance(layers[0], nn.Linear):
+        raise StructureError(f"expected the dynamics to start with a linear layer, received {[type(x).__name__ for x in layers[:1]]}")
+    first, last = layers[0], layers[-1]
+    weights = [first.weight[:, :p], first.weight[:, p:]]
+    # Of one scale in both modules nothing is left but the rounding of a product and a quotient.
+    hidden = graph.linear([0, action], weights, first.bias, roundings=0 if own is None else 3)
+    if own is None:
+        return graph.interface(graph.layers(hidden, layers[1:]))
+    if len(layers) == 1 or not isinstance(last, nn.Linear):
+        raise StructureError("expected the dynamics' network to start and end with different linear layers")
+    hidden = graph.layers(hidden, layers[1:-1])
+    moved = graph.linear([0, hidden], [torch.eye(p), last.weight], last.bias, roundings=1)
     return graph.interface(graph.apply(moved, clamp()))
 
 
-def _net(module: nn.Module, name: str) -> nn.Sequential:
-    net = getattr(module, "net", None)
-    if not isinstance(net, nn.Sequential) or not hasattr(module, "action_scale"):
-        raise ConfigError(
-            f"expected the {name} to be an nn.Sequential, or a module with an nn.Sequential 'net' and an 'action_scale' "
-            f"(modules.LatentDynamics, modules.Policy), received {type(module).__name__}"
+def _taken_apart(module: nn.Module, name: str, form: str) -> tuple[list[nn.Module], Tensor | None]:
+    """The layers of a part of the loop, and its action scale if it is of a form that has one."""
+    if type(module) is nn.Sequential:
+        return flat_layers(module), None
+    related = any(k in FORMS or k is nn.Sequential for k in type(module).__mro__)
+    if related:
+        check_module(module)
+    net = module._modules.get("net")
+    if not related or FORMS.get(type(module)) != form or type(net) is not nn.Sequential:
+        raise StructureError(
+            f"expected the {name} to be an nn.Sequential, or a module of the form '{form}' with an nn.Sequential 'net' "
+            f"(modules.LatentDynamics, modules.Policy, or registered by lipschitz.layers.known_form), received "
+            f"{type(module).__name__}"
         )
-    return net
+    return flat_layers(net), cast(Tensor, getattr(module, "action_scale", None))
+
+
+def _checked_scale(scale: Tensor, actions: int) -> Tensor:
+    valid = isinstance(scale, Tensor) and scale.is_floating_point() and scale.shape in ((actions,), (1,))
+    if not valid or not bool((scale >= _SCALES[0]).all() & (scale <= _SCALES[1]).all()):
+        raise StructureError(
+            f"expected {actions} positive finite action scales within {_SCALES}, where float32 loses nothing, received "
+            f"{scale}; pass the largest action, in another unit if need be",
+            "SCALE_INVALID",
+        )
+    return scale.detach().double().cpu().expand(actions)
 
 
 def decide_invariance(
@@ -307,8 +336,88 @@ def largest_error(
     )
     # What decides, decides by more than the slack.
     return LargestError(
-        -(found.upper + SLACK) / system.lipschitz_bound, -found.lower / system.lipschitz_bound, found
+        _below(-(found.upper + SLACK) / system.lipschitz_bound), (SLACK - found.lower) / system.lipschitz_bound, found
     )
+
+
+def _below(value: float) -> float:
+    """Less than what the last operations, exactly carried out, would give."""
+    return value - 4.0 * math.ulp(value)
+
+
+@dataclass(frozen=True)
+class ComputedError:
+    r"""How large a latent error the numbers that are computed tolerate.
+
+    Attributes:
+        delta: proved: for errors up to this (latent units) the set of the computed barrier is kept by the computed step;
+            at most zero: not even without any.
+        barrier_rounding: what the computed barrier is off at most, anywhere, barrier units.
+        step_rounding: what the computed :math:`d(z, \pi(z))` is off at most, Euclidean norm, latent units.
+    """
+
+    delta: float
+    barrier_rounding: float
+    step_rounding: float
+
+
+def computed_error(
+    system: ClosedLoop,
+    known: LargestError,
+    *,
+    level: float = 0.0,
+    unit: float = 2.0**-24,
+    tolerance: float = 1e-3,
+    budget: Budget | None = None,
+    boxes: int = 8192,
+) -> ComputedError:
+    r"""Largest error for which :math:`\{\hat B \le s\}` is kept by the networks as they are computed.
+
+    .. math:: \delta = - \frac{1}{L_B} \left( \max_{B(z) \le s + \epsilon_B} (B(d(z, \pi(z))) - s) + \epsilon_B \right)
+        - \epsilon_d
+
+    with :math:`\epsilon_B \ge |\hat B - B|` and :math:`\epsilon_d \ge \|\hat d(z, \hat\pi(z)) - d(z, \pi(z))\|` on the
+    whole domain.
+
+    Args:
+        system: the closed loop.
+        known: what it tolerates in real arithmetic.
+        level: s, barrier units.
+        unit: unit roundoff of the dtype.
+        tolerance: distance of the two sides of the maximum at which the search ends, barrier units.
+        budget: when to give up.
+        boxes: number of boxes on which the rounding is bounded.
+
+    Returns:
+        The error and the roundings.
+
+    Source: none.
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
+        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
+        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
+        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
+        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
+        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> known = largest_error(system)
+        >>> 0.0 < known.delta - computed_error(system, known).delta < 1e-3
+        True
+    """
+    lipschitz = system.lipschitz_bound
+    of_barrier, of_step = (
+        largest_rounding(graph, system.low, system.high, unit, boxes=boxes) for graph in (system.barrier, system.step)
+    )
+    if not math.isfinite(of_barrier + of_step):
+        return ComputedError(-math.inf, of_barrier, of_step)
+    lost = of_step + of_barrier / lipschitz
+    delta = known.delta - lost  # what it could be at most
+    if delta > 0.0:
+        found = maximise(
+            system.problem(level=level + of_barrier + SLACK, constant=(-level,)), tolerance=tolerance, budget=budget
+        )
+        delta = -(found.upper + SLACK) / lipschitz - lost
+    return ComputedError(_below(_below(delta)), of_barrier, of_step)
 
 
 def decide_domain(system: ClosedLoop, *, budget: Budget | None = None) -> Outcome:
@@ -482,28 +591,29 @@ def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
     .. math:: L_{cl} \le 1 + L_{net_d} \sqrt{1 + L_{net_\pi}^2}
 
     Args:
-        dynamics: module with ``net`` and ``action_scale`` (a residual network between clamps).
-        policy: module with ``net`` and ``action_scale``.
+        dynamics: module of the form "residual" (``modules.LatentDynamics``).
+        policy: module of the form "bounded" (``modules.Policy``), with the same action scale.
 
     Returns:
         The bound; clamps are 1-Lipschitz.
 
     Raises:
-        ConfigError: if a module is of another form.
+        StructureError: if a module is of another form, or the action scales differ.
 
     Source: none; the constant that paper Theorem 1 leaves out.
 
     Example:
-        >>> from types import SimpleNamespace
-        >>> class Part(nn.Module):
-        ...     def __init__(self, n):
-        ...         super().__init__()
-        ...         self.net, self.action_scale = nn.Sequential(nn.Linear(n, 1)), torch.ones(1)
-        >>> closed_loop_lipschitz(Part(2), Part(1)) > 1
+        >>> from torchrl_sspl.modules import LatentDynamics, Policy
+        >>> closed_loop_lipschitz(LatentDynamics(2, 1), Policy(2, 1)) > 1
         True
     """
-    loop, control = (float(lipschitz_upper(_net(m, n))) for m, n in ((dynamics, "dynamics"), (policy, "policy")))
-    return 1.0 + loop * math.sqrt(1.0 + control * control)
+    (moved, scale), (control, own) = (
+        _taken_apart(m, n, f) for m, n, f in ((dynamics, "dynamics", "residual"), (policy, "policy", "bounded"))
+    )
+    if scale is None or own is None or not torch.equal(scale, own):
+        raise StructureError("expected modules.LatentDynamics and modules.Policy of one action scale, received others")
+    loop, gain = (float(lipschitz_upper(nn.Sequential(*layers))) for layers in (moved, control))
+    return (1.0 + loop * math.sqrt(1.0 + gain * gain)) * (1.0 + 1e-12)
 
 
 def find_counterexamples(

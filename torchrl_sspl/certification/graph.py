@@ -5,14 +5,15 @@ A step may take the output of any earlier one, so that skip connections (:math:`
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor, nn
 
-from torchrl_sspl.certification.activations import Activation, activation_of
-from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.errors import NonFiniteError, ShapeError
+from torchrl_sspl.lipschitz.layers import Activation, activation_of
+from torchrl_sspl.lipschitz.network import flat_layers
 
 
 @dataclass(frozen=True)
@@ -23,11 +24,13 @@ class Affine:
         sources: numbers of the steps whose outputs :math:`x_k` are taken.
         weights: :math:`W_k`, each ``(out, in_k)``, float64.
         bias: ``(out,)``, float64.
+        roundings: of the deployed evaluation, beside those of the products and the sums.
     """
 
     sources: tuple[int, ...]
     weights: tuple[Tensor, ...]
     bias: Tensor
+    roundings: int = 0
 
 
 @dataclass(frozen=True)
@@ -79,13 +82,16 @@ class Graph:
         """Size of the last step."""
         return self.sizes[-1]
 
-    def linear(self, sources: Sequence[int], weights: Sequence[Tensor], bias: Tensor | None = None) -> int:
+    def linear(
+        self, sources: Sequence[int], weights: Sequence[Tensor], bias: Tensor | None = None, *, roundings: int = 0
+    ) -> int:
         """Appends a sum of linear maps.
 
         Args:
             sources: numbers of the steps that are taken.
             weights: one ``(out, in)`` matrix for each.
             bias: ``(out,)``; zero if not given.
+            roundings: of the deployed evaluation, beside those of the products and the sums.
 
         Returns:
             Number of the new step.
@@ -105,7 +111,7 @@ class Graph:
                 )
         if not all(bool(t.isfinite().all()) for t in (*matrices, offset)):
             raise NonFiniteError("expected finite weights, received NaN or infinity; the network cannot be certified")
-        return self._append(Affine(tuple(sources), matrices, offset), out, sources)
+        return self._append(Affine(tuple(sources), matrices, offset, roundings), out, sources)
 
     def apply(self, source: int, activation: Activation) -> int:
         """Appends an activation.
@@ -157,21 +163,25 @@ class Graph:
 
         Args:
             source: number of the step that is taken.
-            network: ``nn.Sequential`` (possibly nested) of linear layers and activations, or a module with a
-                ``collapse()`` method that gives one.
+            network: ``nn.Sequential`` (possibly nested) of linear layers and activations, or a barrier of the library
+                whose ``collapse()`` gives one.
 
         Returns:
             Number of the last new step.
 
         Raises:
-            ConfigError: if a layer is of another kind.
+            StructureError: if a layer is of another kind, or may compute something else than it says.
             ShapeError: if the layers do not fit each other.
             NonFiniteError: if a weight is NaN or infinite.
         """
-        for layer in _layers(network):
-            if type(layer) is nn.Linear:
+        return self.layers(source, flat_layers(network))
+
+    def layers(self, source: int, layers: Sequence[nn.Module]) -> int:
+        """Appends layers that were looked at (:func:`~torchrl_sspl.lipschitz.network.flat_layers`), as :meth:`network`."""
+        for layer in layers:
+            if isinstance(layer, nn.Linear):
                 source = self.linear([source], [layer.weight], layer.bias)
-            elif type(layer) is not nn.Identity:
+            else:
                 source = self.apply(source, activation_of(layer))
         return source
 
@@ -204,22 +214,3 @@ class Graph:
     def __call__(self, point: Tensor) -> Tensor:
         """Value of the function at points, ``(n, input_dim) -> (n, output_dim)``."""
         return self.values(point)[-1]
-
-
-def _layers(network: nn.Module) -> Iterator[nn.Module]:
-    if callable(getattr(network, "collapse", None)):
-        network = network.collapse()  # type: ignore[operator]
-    if network._forward_hooks or network._forward_pre_hooks:
-        raise ConfigError(
-            f"expected layers without forward hooks, received {network}; a hook may change what the layer computes"
-        )
-    if type(network) is nn.Sequential:
-        for part in network:
-            yield from _layers(part)
-    elif list(network.children()):
-        raise ConfigError(
-            f"expected a plain network (nn.Sequential of linear layers and activations), received "
-            f"{type(network).__name__}; pass its layers"
-        )
-    else:
-        yield network

@@ -1,19 +1,19 @@
-r"""The three layers of a certificate: the paper's conditions, what the weights prove, what fresh episodes show."""
+r"""The deterministic layer of a certificate: what the weights prove."""
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget
-from torchrl_sspl.certification.certificate import ASSUMED, MEASURED, PROVED, Layer, Reason, Statement
+from torchrl_sspl.certification.certificate import PROVED, Layer, Reason, Statement
 from torchrl_sspl.certification.conditions import (
+    ClosedLoop,
     closed_loop,
+    computed_error,
     decide_domain,
     decide_invariance,
     decide_vacuity,
@@ -21,8 +21,10 @@ from torchrl_sspl.certification.conditions import (
     largest_error,
     search_level,
 )
-from torchrl_sspl.certification.statistics import clopper_pearson
-from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.certification.deployed import check_deployed, deployed_dtype
+from torchrl_sspl.certification.floating import UNITS
+from torchrl_sspl.certification.rounding import up
+from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError, StructureError
 from torchrl_sspl.lipschitz import prove_lipschitz
 
 
@@ -73,102 +75,123 @@ def deterministic_layer(
         >>> layer.holds, round(layer["tolerated error"].value, 2)
         (True, 0.12)
     """
-    layer = Layer("deterministic")
-
-    def state(name: str, text: str, holds: bool, reason: Reason | None = None, **more: Any) -> None:
-        code = "" if holds or reason is None else reason.name
-        layer.statements.append(Statement(name, text, PROVED, holds, reason=code, **more))
-
+    proof = _Proof(level, required_error, tolerance, budget)
     if level > 0:
-        state("level", "s <= 0", False, Reason.LEVEL, value=level, unit="barrier", misses_by=level)
-        return layer
-    try:
-        system = closed_loop(
-            barrier, dynamics, policy, latent_dim=latent_dim, lipschitz_bound=lipschitz_bound, low=low, high=high
+        proof.state("level", "s <= 0", False, Reason.LEVEL, value=level, unit="barrier", misses_by=level)
+        return proof.layer
+    of = {"latent_dim": latent_dim, "lipschitz_bound": lipschitz_bound, "low": low, "high": high}
+    system = proof.networks(barrier, dynamics, policy, of)
+    if system is None or not proof.lipschitz(barrier, lipschitz_bound, multipliers):
+        return proof.layer  # the searches below use the constant
+    proof.domain(system)
+    if proof.vacuity(system):
+        if proof.invariance(system):
+            proof.tolerated(system, deployed_dtype(barrier, dynamics, policy))
+        proof.rounding(system)
+    return proof.layer
+
+
+class _Proof:
+    """The layer as it grows; each method adds statements, and says whether the next ones have a meaning."""
+
+    def __init__(self, level: float, required_error: float, tolerance: float, budget: Budget | None) -> None:
+        self.level, self.required, self.tolerance, self.budget = level, required_error, tolerance, budget
+        self.layer = Layer("deterministic")
+
+    def state(self, name: str, text: str, holds: bool, reason: Reason | None = None, **more: Any) -> bool:
+        """Adds a statement; the reason is why it does not hold, if it does not."""
+        code = "" if holds or reason is None else reason.name
+        self.layer.statements.append(Statement(name, text, PROVED, holds, reason=code, **more))
+        return holds
+
+    def networks(self, barrier: nn.Module, dynamics: nn.Module, policy: nn.Module, of: dict[str, Any]) -> ClosedLoop | None:
+        """The closed loop, if it is what the modules compute."""
+        text = "the modules that are deployed compute what is proved, up to rounding: known types, nothing in between, equal values"
+        try:
+            system = closed_loop(barrier, dynamics, policy, **of)
+            points = check_deployed(system, barrier, dynamics, policy)
+        except NonFiniteError as error:
+            self.state("networks", "all weights are finite", False, Reason.NOT_FINITE, detail=str(error))
+        except StructureError as error:
+            self.state("deployed", text, False, Reason[error.reason], detail=str(error))
+        except (ConfigError, ShapeError) as error:
+            text = "bounds can be propagated through the networks"
+            self.state("networks", text, False, Reason.NOT_UNDERSTOOD, detail=str(error))
+        else:
+            self.state("deployed", text, True, detail=f"values compared at {points} points")
+            return system
+        return None
+
+    def lipschitz(self, barrier: nn.Module, bound: float, multipliers: Sequence[Tensor] | None) -> bool:
+        try:
+            proof = prove_lipschitz(barrier, bound, multipliers=multipliers)
+            proved, why = proof.proved, proof.reason
+        except (ConfigError, ShapeError) as error:
+            proved, why = False, str(error)
+        text = f"B is {up(bound, 6)}-Lipschitz (exact arithmetic on the deployed weights)"
+        of = {"value": bound, "unit": "barrier / latent", "detail": why}
+        return self.state("Lipschitz constant", text, proved, Reason.LIPSCHITZ_NOT_PROVED, **of)
+
+    def domain(self, system: ClosedLoop) -> None:
+        found = decide_domain(system, budget=self.budget)
+        left = found.status == "refuted"
+        reason, miss = (Reason.LEAVES_DOMAIN, found.lower) if left else (Reason.UNDECIDED, None)
+        text = "d(z, pi(z)) stays in the latent domain"
+        self.state("domain", text, found.status == "proved", reason, unit="latent", misses_by=miss)
+
+    def vacuity(self, system: ClosedLoop) -> bool:
+        status = decide_vacuity(system, level=self.level, budget=self.budget).status
+        reasons = {"empty": Reason.EMPTY, "everything": Reason.EVERYTHING, "undecided": Reason.VACUITY_UNDECIDED}
+        text = "{B <= s} is neither empty nor the whole domain"
+        self.state("not vacuous", text, status == "neither", reasons.get(status))
+        return status != "empty"
+
+    def invariance(self, system: ClosedLoop) -> bool:
+        kept = decide_invariance(system, level=self.level, budget=self.budget)
+        refuted = kept.status == "refuted"
+        detail = f"{kept.boxes} boxes"
+        if refuted and kept.witness is not None:
+            detail = f"counterexample z = {kept.witness.tolist()}"
+        elif kept.status == "undecided":
+            detail += f", {up(kept.remaining_volume, 2)} of the domain is left"
+        return self.state(
+            "invariance",
+            "B(z) <= s implies B(d(z, pi(z))) <= s, for every z of the domain",
+            kept.status == "proved",
+            Reason.NOT_INVARIANT if refuted else Reason.UNDECIDED,
+            unit="barrier",
+            misses_by=max(kept.lower, 0.0) if refuted else None,
+            detail=detail,
         )
-    except NonFiniteError as error:
-        state("networks", "all weights are finite", False, Reason.NOT_FINITE, detail=str(error))
-        return layer
-    except (ConfigError, ShapeError) as error:
-        state(
-            "networks", "bounds can be propagated through the networks", False, Reason.NOT_UNDERSTOOD, detail=str(error)
-        )
-        return layer
 
-    text = f"B is {lipschitz_bound:g}-Lipschitz (exact arithmetic on the deployed weights)"
-    proof = prove_lipschitz(barrier, lipschitz_bound, multipliers=multipliers)
-    state(
-        "Lipschitz constant",
-        text,
-        proof.proved,
-        Reason.LIPSCHITZ_NOT_PROVED,
-        value=lipschitz_bound,
-        unit="barrier / latent",
-        detail=proof.reason,
-    )
-    if not proof.proved:
-        return layer  # the searches below use the constant
+    def tolerated(self, system: ClosedLoop, dtype: torch.dtype) -> None:
+        """Which error the set tolerates, in real arithmetic and in that of the computed numbers."""
+        how: dict[str, Any] = {"level": self.level, "tolerance": self.tolerance, "budget": self.budget}
+        found = largest_error(system, **how)
+        text = "the same, whatever error of at most this is added to d(z, pi(z))"
+        detail = f"for errors above {up(found.refuted_above)} the argument fails"
+        if not self._error("tolerated error", text, found.delta, Reason.MARGIN_TOO_SMALL, detail):
+            return
+        name = str(dtype).removeprefix("torch.")
+        real = computed_error(system, found, unit=UNITS[dtype], **how)
+        text = f"the same of the {name} numbers that are computed, in whatever order they are summed, for errors of at most this"
+        detail = f"rounding of B at most {up(real.barrier_rounding, 2)}, of d(z, pi(z)) at most {up(real.step_rounding, 2)}"
+        short = name == "float32" and not self._enough(real.delta)
+        self._error(name, text, real.delta, Reason.ROUNDING, detail + ("; deploy in float64" if short else ""))
 
-    domain = decide_domain(system, budget=budget)
-    reason = Reason.LEAVES_DOMAIN if domain.status == "refuted" else Reason.UNDECIDED
-    miss = None if domain.status != "refuted" else domain.lower
-    state(
-        "domain",
-        "d(z, pi(z)) stays in the latent domain",
-        domain.status == "proved",
-        reason,
-        unit="latent",
-        misses_by=miss,
-    )
+    def _error(self, name: str, text: str, delta: float, reason: Reason, detail: str) -> bool:
+        enough = self._enough(delta)
+        miss = None if enough else max(self.required - delta, 0.0)
+        return self.state(name, text, enough, reason, value=delta, unit="latent", misses_by=miss, detail=detail)
 
-    vacuity = decide_vacuity(system, level=level, budget=budget)
-    reasons = {"empty": Reason.EMPTY, "everything": Reason.EVERYTHING, "undecided": Reason.VACUITY_UNDECIDED}
-    neither = vacuity.status == "neither"
-    state("not vacuous", "{B <= s} is neither empty nor the whole domain", neither, reasons.get(vacuity.status))
-    if vacuity.status == "empty":
-        return layer
+    def _enough(self, delta: float) -> bool:
+        return delta >= self.required and delta > 0.0
 
-    kept = decide_invariance(system, level=level, budget=budget)
-    reason = Reason.NOT_INVARIANT if kept.status == "refuted" else Reason.UNDECIDED
-    detail = f"{kept.boxes} boxes"
-    if kept.status == "refuted" and kept.witness is not None:
-        detail = f"counterexample z = {[round(float(v), 6) for v in kept.witness]}"
-    elif kept.status == "undecided":
-        detail += f", {kept.remaining_volume:.2g} of the domain is left"
-    state(
-        "invariance",
-        "B(z) <= s implies B(d(z, pi(z))) <= s, for every z of the domain",
-        kept.status == "proved",
-        reason,
-        unit="barrier",
-        misses_by=max(kept.lower, 0.0) if kept.status == "refuted" else None,
-        detail=detail,
-    )
-
-    if kept.status == "proved":
-        found = largest_error(system, level=level, tolerance=tolerance, budget=budget)
-        enough = found.delta >= required_error and found.delta > 0.0
-        state(
-            "tolerated error",
-            "the same, whatever error of at most this is added to d(z, pi(z))",
-            enough,
-            Reason.MARGIN_TOO_SMALL,
-            value=found.delta,
-            unit="latent",
-            misses_by=None if enough else max(required_error - found.delta, 0.0),
-            detail=f"for errors above {found.refuted_above:.4g} the argument fails",
-        )
-    rounding = evaluation_rounding(system)
-    state(
-        "rounding",
-        "rounding of the float64 evaluation is far below the slack by which bounds decide",
-        rounding < 0.1 * SLACK,
-        Reason.UNDECIDED,
-        value=rounding,
-        unit="barrier",
-        detail=f"slack {SLACK:g}",
-    )
-    return layer
+    def rounding(self, system: ClosedLoop) -> None:
+        value = evaluation_rounding(system)
+        text = "rounding of the float64 evaluation is far below the slack by which bounds decide"
+        of = {"value": value, "unit": "barrier", "detail": f"slack {SLACK:g}"}
+        self.state("rounding", text, value < 0.1 * SLACK, Reason.UNDECIDED, **of)
 
 
 def level_that_holds(
@@ -212,325 +235,3 @@ def level_that_holds(
         return levels[0]
     found = search_level(system, levels=levels, budget=budget)
     return levels[0] if found is None else found[0]
-
-
-@dataclass
-class Sample:
-    """Fresh measurements of a frozen agent.
-
-    Attributes:
-        error: ``(n,)`` largest error of the latent dynamics in each episode from the set, latent units.
-        left: ``(n,)`` bool, whether the episode left the set.
-        unsafe: ``(m,)`` barrier values of fresh unsafe observations.
-        latent: ``(k, p)`` latents of fresh observations, to see that they lie in the domain.
-        horizon: steps per episode.
-        seed: seed with which they were drawn.
-        used_seeds: seeds with which anything was trained, chosen or tuned.
-        fingerprints: of the labelled observations (see :func:`fingerprint`), to compare with those trained on.
-        trained_on: fingerprints of the observations that were trained on, where they are at hand.
-        rims: rows of a table: name of a part of the set, n steps, 99.9 % and largest error there.
-        starts: where the episodes began.
-    """
-
-    error: Tensor
-    left: Tensor
-    unsafe: Tensor
-    latent: Tensor
-    horizon: int
-    seed: int
-    used_seeds: Sequence[int] = ()
-    fingerprints: Sequence[str] = ()
-    trained_on: Sequence[str] = ()
-    rims: Sequence[tuple[str, int, float, float]] = ()
-    starts: str = "uniformly in the set"
-
-
-def fingerprint(observations: Tensor) -> list[str]:
-    """A short hash of each observation, to find out whether two data sets share any.
-
-    Args:
-        observations: ``(n, ...)``.
-
-    Returns:
-        n hexadecimal strings.
-
-    Source: none.
-
-    Example:
-        >>> a, b = fingerprint(torch.tensor([[1, 2], [1, 3]], dtype=torch.uint8))
-        >>> a == b
-        False
-    """
-    rows = observations.detach().cpu().contiguous().reshape(len(observations), -1).view(torch.uint8).numpy()
-    return [hashlib.blake2b(row.tobytes(), digest_size=8).hexdigest() for row in rows]
-
-
-def statistical_layer(
-    sample: Sample,
-    *,
-    level: float = 0.0,
-    tolerated_error: float | None = None,
-    confidence: float = 0.95,
-    acceptable: float = 0.01,
-    low: float = -1.0,
-    high: float = 1.0,
-) -> Layer:
-    r"""What holds for fresh episodes, with which confidence.
-
-    The unit is the episode: steps of one episode are not independent. With k events among n,
-    :math:`P \le \operatorname{Beta}^{-1}(c; k + 1, n - k)`; two statements together hold with the sum of their risks,
-    each at confidence :math:`1 - (1 - c) / 2`.
-
-    Args:
-        sample: fresh measurements, drawn after the networks were frozen.
-        level: s, barrier units.
-        tolerated_error: proved, latent units; None where nothing was proved.
-        confidence: c.
-        acceptable: risk above which the layer does not hold, per episode and per unsafe observation together.
-        low: lower end of the domain.
-        high: upper end.
-
-    Returns:
-        The layer.
-
-    Raises:
-        ConfigError: if confidence or the acceptable risk is not between 0 and 1.
-
-    Source: Clopper and Pearson (1934); the paper has no statistical statement.
-
-    Example:
-        >>> sample = Sample(torch.zeros(3000), torch.zeros(3000, dtype=torch.bool), torch.ones(3000), torch.zeros(9, 2), 200, 7)
-        >>> layer = statistical_layer(sample, tolerated_error=0.1)
-        >>> layer.holds, round(layer["risk"].value, 4)
-        (True, 0.0025)
-    """
-    if not 0.0 < confidence < 1.0 or not 0.0 < acceptable < 1.0:
-        raise ConfigError(f"expected confidence and acceptable in (0, 1), received {confidence} and {acceptable}")
-    layer = Layer("statistical")
-    add = layer.statements.append
-    measured = [t.double() for t in (sample.error, sample.unsafe, sample.latent)]
-    n, m = len(sample.error), len(sample.unsafe)
-
-    def fails(name: str, text: str, reason: Reason, **more: Any) -> Layer:
-        add(Statement(name, text, MEASURED, False, reason=reason.name, **more))
-        return layer
-
-    if not n or not m:
-        return fails("sample", "fresh episodes and unsafe observations were measured", Reason.NOT_MEASURED, n=min(n, m))
-    if not all(bool(t.isfinite().all()) for t in measured):
-        return fails("sample", "all measured values are finite", Reason.NOT_FINITE, n=n)
-    if sample.seed in sample.used_seeds or len(set(sample.fingerprints)) < len(sample.fingerprints):
-        return fails("fresh", "the episodes are fresh and all different", Reason.CALIBRATION_REUSED, n=n)
-    if set(sample.fingerprints) & set(sample.trained_on):
-        return fails("fresh", "no labelled observation was trained on", Reason.LABELS_LEAKED, n=m)
-
-    beyond = (
-        (sample.latent.double() - 0.5 * (high + low)).abs().amax() - 0.5 * (high - low)
-        if sample.latent.numel()
-        else None
-    )
-    inside_domain = beyond is None or float(beyond) <= 0.0
-    add(
-        Statement(
-            "encoder",
-            "the latents of fresh observations lie in the domain",
-            MEASURED,
-            inside_domain,
-            n=len(sample.latent),
-            unit="latent",
-            reason="" if inside_domain else Reason.OUTSIDE_DOMAIN.name,
-            misses_by=None if inside_domain or beyond is None else float(beyond),
-        )
-    )
-    each = 1.0 - 0.5 * (1.0 - confidence)
-    left, aliased = int(sample.left.sum()), int((sample.unsafe <= level).sum())
-    risk_left, risk_alias = _upper(left, n, each), _upper(aliased, m, each)
-    add(
-        Statement(
-            "episodes",
-            f"episodes of {sample.horizon} steps from {{B <= s}} that leave it: {left} of {n}; at most",
-            MEASURED,
-            risk_left <= acceptable,
-            risk_left,
-            "share",
-            n,
-            each,
-            "" if risk_left <= acceptable else _why(left, n, acceptable, each, Reason.EPISODES_LEAVE),
-            max(risk_left - acceptable, 0.0) or None,
-        )
-    )
-    add(
-        Statement(
-            "unsafe observations",
-            f"unsafe observations with B <= s: {aliased} of {m}; at most",
-            MEASURED,
-            risk_alias <= acceptable,
-            risk_alias,
-            "share",
-            m,
-            each,
-            "" if risk_alias <= acceptable else _why(aliased, m, acceptable, each, Reason.UNSAFE_INSIDE),
-            max(risk_alias - acceptable, 0.0) or None,
-        )
-    )
-    total = risk_left + risk_alias
-    both = "" if total <= acceptable or any(s.reason for s in layer.statements) else Reason.TOO_FEW.name
-    add(
-        Statement(
-            "risk",
-            "either of the two, by the union bound, at most",
-            MEASURED,
-            total <= acceptable,
-            total,
-            "share",
-            min(n, m),
-            confidence,
-            both,
-            max(total - acceptable, 0.0) or None,
-        )
-    )
-    add(_theorem(sample, tolerated_error, confidence))
-    for name, steps, high_quantile, largest in sample.rims:
-        add(
-            Statement(
-                f"error {name}",
-                "99.9 % of the errors of steps there are at most",
-                MEASURED,
-                True,
-                high_quantile,
-                "latent",
-                steps,
-                None,
-                detail=f"largest {largest:.4g}",
-            )
-        )
-    for name, text in (
-        ("starts", f"episodes start as the measured ones did: {sample.starts}"),
-        ("system", "camera, physics and appearance stay as they were"),
-    ):
-        add(Statement(name, text, ASSUMED, None))
-    return layer
-
-
-def _theorem(sample: Sample, tolerated_error: float | None, confidence: float) -> Statement:
-    """Whether the deterministic statement carries over to real episodes: it does where errors are tolerated."""
-    n = len(sample.error)
-    name = "errors tolerated"
-    if tolerated_error is None or tolerated_error <= 0:
-        return Statement(
-            name, "no error is proved to be tolerated, so the proof says nothing about episodes", ASSUMED, None, n=n
-        )
-    exceed = int((sample.error > tolerated_error).sum())
-    worst = float(sample.error.double().quantile(0.999))
-    # A remark, not a requirement: invariance of the episodes is measured directly above.
-    return Statement(
-        name,
-        f"episodes with an error above the tolerated one of {tolerated_error:.3g}: {exceed} of {n}; at most",
-        ASSUMED,
-        None,
-        _upper(exceed, n, confidence),
-        "share",
-        n,
-        confidence,
-        detail=("in all other episodes the proof applies; " if exceed < n else "the proof alone covers no episode: ")
-        + f"99.9 % of the episodes' errors are at most {worst:.3g} latent, "
-        + (
-            f"{worst - tolerated_error:.3g} more than is tolerated" if worst > tolerated_error else "which is tolerated"
-        ),
-    )
-
-
-def _upper(events: int, n: int, confidence: float) -> float:
-    """One-sided upper bound."""
-    return (
-        1.0
-        if events == n
-        else clopper_pearson(events, n, confidence=confidence if events == 0 else 2 * confidence - 1)[1]
-    )
-
-
-def _why(events: int, n: int, acceptable: float, confidence: float, reason: Reason) -> str:
-    """No event among so few that even none proves little is no fault of the agent."""
-    return Reason.TOO_FEW.name if events == 0 and _upper(0, n, confidence) > acceptable else reason.name
-
-
-def paper_layer(
-    *,
-    safe: Tensor,
-    unsafe: Tensor,
-    following: Tensor,
-    lipschitz_bound: float,
-    covering_radius: float,
-    dynamics_error: float,
-    closed_loop_constant: float,
-) -> Layer:
-    r"""The paper's conditions on held-out samples, with its margins, and with those that its proof would need.
-
-    .. math:: \psi = L_B \bar\epsilon, \; \eta = L_B \delta; \quad
-        q_1 = B(z) + \psi \le 0 \;(S), \quad q_2 = -B(z) + \psi \le 0 \;(U), \quad
-        q_3 = B(d(z, \pi(z))) + \psi_3 + \eta \le 0 \;(B \le 0)
-
-    Args:
-        safe: ``(n,)`` barrier values of held-out observations of S.
-        unsafe: ``(m,)`` of U.
-        following: ``(k,)`` values of :math:`B(d(z, \pi(z)))` for held-out latents with B <= 0.
-        lipschitz_bound: :math:`L_B`.
-        covering_radius: :math:`\bar\epsilon`, latent units.
-        dynamics_error: :math:`\delta`, latent units.
-        closed_loop_constant: certified Lipschitz constant of :math:`z \mapsto d(z, \pi(z))`.
-
-    Returns:
-        The layer.
-
-    Source: paper eq. (3)-(5) and Theorem 1; deviations: q1, q2, q3 are asked where they make sense (S, U, the set), and
-    :math:`\psi_3` is given in both forms.
-
-    Example:
-        >>> layer = paper_layer(safe=torch.tensor([-1.0]), unsafe=torch.tensor([1.0]), following=torch.tensor([-0.1]),
-        ...                     lipschitz_bound=2.0, covering_radius=0.1, dynamics_error=0.01, closed_loop_constant=1.5)
-        >>> layer.holds, layer.verdict
-        (False, "not certified: q3 (a condition does not hold on the held-out samples with the paper's margins, misses by 0.12 barrier)")
-    """
-    layer = Layer("paper")
-    psi, eta = lipschitz_bound * covering_radius, lipschitz_bound * dynamics_error
-    psi3 = psi * (closed_loop_constant + 1.0)
-    for name, text, value in (
-        ("safety margin", "psi* = L_B eps-bar, sampled", psi),
-        ("dynamics margin", "eta* = L_B delta, sampled", eta),
-        (
-            "safety margin of q3",
-            "psi* with the Lipschitz constant that the proof of q3 needs, L_B (L_cl + 1) eps-bar",
-            psi3,
-        ),
-    ):
-        layer.statements.append(Statement(name, text, ASSUMED, None, value, "barrier"))
-
-    def condition(name: str, text: str, excess: Tensor) -> None:
-        n = len(excess)
-        if not n or not bool(excess.isfinite().all()):
-            reason = Reason.NOT_FINITE if n else Reason.NOT_MEASURED
-            layer.statements.append(Statement(name, text, MEASURED, False, n=n, reason=reason.name))
-            return
-        worst, met = float(excess.max()), 100 * float((excess <= 0).double().mean())
-        layer.statements.append(
-            Statement(
-                name,
-                f"{text}: worst excess",
-                MEASURED,
-                worst <= 0,
-                worst,
-                "barrier",
-                n,
-                reason="" if worst <= 0 else Reason.CONDITION_FAILS.name,
-                misses_by=worst if worst > 0 else None,
-                detail=f"holds on {met:.4g} % of the samples",
-            )
-        )
-
-    condition("q1", "B + psi* <= 0 on held-out observations of S", safe.double() + psi)
-    condition("q2", "-B + psi* <= 0 on held-out observations of U", psi - unsafe.double())
-    condition("q3", "B(d(z, pi(z))) + psi* + eta* <= 0 on {B <= 0}", following.double() + psi + eta)
-    condition(
-        "q3 as its proof needs it", "the same with the margin that the proof needs", following.double() + psi3 + eta
-    )
-    return layer

@@ -9,8 +9,8 @@ On a box :math:`|z - c| \le r` every step x of a :class:`~torchrl_sspl.certifica
 Forward bounds widen from layer to layer. At the interfaces of a graph (the action, the next latent: few numbers that
 everything passes through) they are replaced by backward bounds, and later backward passes end there; and where it is
 asked for, the intervals of all undecided activations are replaced too. Skip connections carry z itself as a linear map,
-so that nothing is lost on them. All arithmetic is float64; what it may round off is bounded by :func:`rounding_bound`,
-and a slack far above it is demanded wherever a bound decides.
+so that nothing is lost on them. All arithmetic is float64; what it may round off is bounded by
+:func:`~torchrl_sspl.certification.floating.rounding_bound`, and a slack far above it is demanded wherever a bound decides.
 """
 
 from __future__ import annotations
@@ -191,7 +191,13 @@ class Enclosure:
 
     def interval(self, step: int | None = None) -> tuple[Tensor, Tensor]:
         """Interval of a step that was bounded last or is an interface, lower and upper ends ``(n, size)``."""
-        return self._forms[len(self.graph.steps) - 1 if step is None else step].interval(self.radius)
+        number = len(self.graph.steps) - 1 if step is None else step
+        low, high = self._forms[number].interval(self.radius)
+        part = self.graph.steps[number]
+        if isinstance(part, Apply):  # the values of a clamp lie within it, those of its lines need not
+            least, most = part.activation.interval(*self._intervals[part.source])
+            low, high = torch.maximum(low, least), torch.minimum(high, most)
+        return low, high
 
     def slope(self, step: int) -> Tensor:
         """Linear part of an interface, ``(n, p, size)``."""
@@ -308,59 +314,3 @@ def interval_bounds(graph: Graph, low: Tensor, high: Tensor) -> list[tuple[Tenso
                 radius = radius + 0.5 * (above - below) @ weight.abs().mT
             bounds.append((center - radius, center + radius))
     return bounds
-
-
-def rounding_bound(graph: Graph, low: Tensor, high: Tensor, unit: float = 2.0**-24) -> list[Tensor]:
-    r"""How far a floating-point evaluation of each step can be from its exact value, for every point of the boxes.
-
-    .. math::
-        e = \sum_k |W_k| e_k + \gamma_m \left( \sum_k |W_k| (|x_k| + e_k) + |b| \right), \qquad
-        \gamma_m = \frac{m u}{1 - m u}
-
-    with m the number of terms of the sum and a few roundings more; any order of summation is covered. Activations pass
-    an error on by their steepest slope, smooth ones add eight units in the last place.
-
-    Args:
-        graph: the function, with exact weights.
-        low: lower corners, ``(n, p)`` float64; small boxes give tight bounds.
-        high: upper corners, ``(n, p)`` float64.
-        unit: unit roundoff u: 2^-24 for IEEE float32 (no TF32), 2^-53 for float64.
-
-    Returns:
-        For each step ``(n, size)``, bounds of the error.
-
-    Raises:
-        ShapeError: if the corners do not fit the graph.
-
-    Source: Higham 2002, section 3.1.
-
-    Example:
-        >>> graph = Graph(1)
-        >>> _ = graph.linear([0], [torch.tensor([[2.0]])])
-        >>> 0.0 < rounding_bound(graph, -torch.ones(1, 1).double(), torch.ones(1, 1).double())[-1].item() < 2e-6
-        True
-    """
-    box = Enclosure(graph, low, high, tight=True)
-    errors = [torch.zeros_like(low)]
-    sizes = [torch.maximum(low.abs(), high.abs())]
-    for number, step in enumerate(graph.steps[1:], start=1):
-        if isinstance(step, Affine):
-            terms = sum(w.shape[1] for w in step.weights) + 6
-            gamma = terms * unit / (1.0 - terms * unit)
-            size, error = step.bias.abs().expand(len(low), -1), torch.zeros(len(low), len(step.bias), dtype=low.dtype)
-            for source, weight in zip(step.sources, step.weights, strict=True):
-                error = error + errors[source] @ weight.abs().mT
-                size = size + (sizes[source] + errors[source]) @ weight.abs().mT
-            errors.append((error + gamma * size) * (1 + 1e-6) + 1e-36)
-            if number in box._intervals:
-                below, above = box._intervals[number]
-                size = torch.minimum(size, torch.maximum(-below, above))
-            sizes.append(size)
-        elif isinstance(step, Apply):
-            act = step.activation
-            size = torch.stack([t.abs() for t in act.interval(*box._intervals[step.source])]).amax(0)
-            error = max(abs(act.slope[0]), abs(act.slope[1])) * errors[step.source]
-            exact = not act.curvature and all(s in (-1.0, 0.0, 1.0) for s in act.slope)
-            errors.append(error if exact else error + 8 * unit * (size + error) + 1e-36)
-            sizes.append(size)
-    return errors

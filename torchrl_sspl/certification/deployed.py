@@ -1,0 +1,126 @@
+"""Whether the modules that are deployed compute what is proved: values at many points, against the graph.
+
+That the modules have the structure of the graph is checked when it is built (exact types, no hooks, nothing overridden, see
+:func:`~torchrl_sspl.lipschitz.network.check_module`). Here their values are compared with it, in the dtype and on the device
+on which they are deployed; the two may differ by what rounding can do at that point, and by nothing else.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sspl.certification.conditions import ClosedLoop
+from torchrl_sspl.certification.floating import UNITS, rounding_bound
+from torchrl_sspl.errors import SSPLError, StructureError
+
+POINTS = 1000
+_CORNERS = 256
+
+
+def deployed_dtype(*modules: nn.Module) -> torch.dtype:
+    """The one dtype of all weights.
+
+    Args:
+        modules: the networks.
+
+    Returns:
+        float32 or float64.
+
+    Raises:
+        StructureError: if there are several, or another one.
+
+    Source: none.
+
+    Example:
+        >>> deployed_dtype(nn.Linear(1, 1), nn.Linear(1, 1))
+        torch.float32
+    """
+    found = {t.dtype for m in modules for t in itertools.chain(m.parameters(), m.buffers())}
+    if len(found) != 1 or not found <= set(UNITS):
+        names = sorted(map(str, found))
+        raise StructureError(f"expected networks of torch.float32 or of torch.float64, received {names}", "WRONG_DTYPE")
+    return found.pop()
+
+
+@torch.no_grad()
+def check_deployed(
+    system: ClosedLoop, barrier: nn.Module, dynamics: nn.Module, policy: nn.Module, *, n: int = POINTS, seed: int = 0
+) -> int:
+    """Compares the modules with the closed loop that was built from them.
+
+    Args:
+        system: the closed loop.
+        barrier: as for :func:`~torchrl_sspl.certification.conditions.closed_loop`, but plain: what ``collapse()`` gives is
+            another module.
+        dynamics: see there.
+        policy: see there.
+        n: number of random points; corners of the domain and its centre come besides.
+        seed: of the random points.
+
+    Returns:
+        Number of points.
+
+    Raises:
+        StructureError: if the values differ by more than rounding allows, the modules change their input, or the dtypes are
+            not one of float32 and float64.
+
+    Source: none.
+
+    Example:
+        >>> from torchrl_sspl.certification import closed_loop
+        >>> parts = nn.Sequential(nn.Linear(1, 1)), nn.Sequential(nn.Linear(2, 1)), nn.Sequential(nn.Linear(1, 1))
+        >>> check_deployed(closed_loop(*parts, latent_dim=1, lipschitz_bound=9.0), *parts, n=10)
+        13
+    """
+    if type(barrier) is not nn.Sequential:
+        raise StructureError(
+            f"expected the barrier that is deployed as an nn.Sequential, received {type(barrier).__name__}; pass its collapse()"
+        )
+    dtype = deployed_dtype(barrier, dynamics, policy)
+    device = next(itertools.chain(barrier.parameters())).device
+    point = _points(system, n, seed).to(dtype).double().clamp(system.low, system.high)
+    given: Tensor = point.to(device, dtype)
+
+    def step(z: Tensor) -> Tensor:
+        u = policy(z)
+        return dynamics(torch.cat([z, u], -1)) if type(dynamics) is nn.Sequential else dynamics(z, u)
+
+    for name, graph, function in (("barrier", system.barrier, barrier), ("d(z, pi(z))", system.step, step)):
+        first, second = (rounding_bound(graph, point, point, unit, refined=True)[-1] for unit in (UNITS[dtype], 2.0**-53))
+        exact = graph(point)
+        # In one batch, and some alone: the sums may be taken in another order, and nothing may remember the batch.
+        for rows in (slice(None), *(slice(k, k + 1) for k in range(0, len(point), max(1, len(point) // 8)))):
+            z = given[rows].clone()
+            try:
+                value = function(z)
+            except (SSPLError, RuntimeError, ValueError, TypeError, IndexError) as error:
+                raise StructureError(f"expected the {name} to be computable, received {error}", "VALUES_DIFFER") from error
+            if value.shape != exact[rows].shape or value.dtype != dtype or not torch.equal(z, given[rows]):
+                raise StructureError(
+                    f"expected the {name} of shape {tuple(exact[rows].shape)} and {dtype}, its input unchanged, received "
+                    f"{tuple(value.shape)} and {value.dtype}",
+                    "VALUES_DIFFER",
+                )
+            gap = (value.double().cpu() - exact[rows]).abs()
+            if not bool((gap <= (first + second)[rows]).all()):
+                raise StructureError(
+                    f"expected the deployed {name} to be what is proved up to rounding, received values that differ by "
+                    f"{float(gap.max()):.3g}; deploy the networks that are certified",
+                    "VALUES_DIFFER",
+                )
+    return len(point)
+
+
+def _points(system: ClosedLoop, n: int, seed: int) -> Tensor:
+    """Random points, corners (some of them where they are many), the centre."""
+    generator = torch.Generator().manual_seed(seed)
+    p, span = system.latent_dim, system.high - system.low
+    share = [torch.rand(n, p, generator=generator, dtype=torch.float64), torch.full((1, p), 0.5, dtype=torch.float64)]
+    if 2**p <= _CORNERS:
+        share.append(torch.cartesian_prod(*[torch.tensor([0.0, 1.0], dtype=torch.float64)] * p).reshape(-1, p))
+    else:
+        share.append(torch.randint(0, 2, (_CORNERS, p), generator=generator).double())
+    return system.low + span * torch.cat(share)

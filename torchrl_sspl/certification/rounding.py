@@ -1,0 +1,116 @@
+"""Numbers of a certificate for people: rounded outward, so that what is printed is never more than what was found."""
+
+from __future__ import annotations
+
+import math
+from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
+from typing import Protocol
+
+#: Statements whose value is a bound from below; every other value bounds something from above.
+LOWER_BOUNDS = ("tolerated error", "float32", "float64")
+
+
+class Shown(Protocol):
+    """What is needed of a statement to print its number."""
+
+    name: str
+    value: float | None
+    unit: str
+    misses_by: float | None
+
+
+def up(value: float, digits: int = 4) -> str:
+    """The number with so many digits, rounded up: for bounds from above.
+
+    Args:
+        value: the number.
+        digits: significant ones.
+
+    Returns:
+        The text; never less than the number.
+
+    Source: none.
+
+    Example:
+        >>> up(1.2345644, 6), up(-0.12349), up(2.0), up(5.17e-9, 2)
+        ('1.23457', '-0.1234', '2', '5.2e-09')
+    """
+    return _rounded(value, digits, ROUND_CEILING)
+
+
+def down(value: float, digits: int = 4) -> str:
+    """The number with so many digits, rounded down: for bounds from below.
+
+    Args:
+        value: the number.
+        digits: significant ones.
+
+    Returns:
+        The text; never more than the number.
+
+    Source: none.
+
+    Example:
+        >>> down(0.0110472), down(-1.00001)
+        ('0.01104', '-1.001')
+    """
+    return _rounded(value, digits, ROUND_FLOOR)
+
+
+def shown(statement: Shown, digits: int = 4) -> str:
+    """Value and unit of a statement, rounded to the side on which it is still true.
+
+    Args:
+        statement: of a certificate.
+        digits: significant ones.
+
+    Returns:
+        The text, "" where there is no value; shares in per cent.
+
+    Source: none.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> shown(SimpleNamespace(name="tolerated error", value=0.0110472, unit="latent"))
+        '0.01104 latent'
+        >>> shown(SimpleNamespace(name="risk", value=0.00123401, unit="share"))
+        '0.1235 %'
+    """
+    if statement.value is None:
+        return ""
+    return _with_unit(statement.value, statement.unit, digits, statement.name in LOWER_BOUNDS)
+
+
+def missed(statement: Shown, digits: int = 3) -> str:
+    """By how much a statement fails, at most; what was found by a search may be exceeded elsewhere.
+
+    Args:
+        statement: of a certificate.
+        digits: significant ones.
+
+    Returns:
+        The text, "" where nothing is known.
+
+    Source: none.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> missed(SimpleNamespace(misses_by=0.05081, unit="barrier"))
+        '0.0509 barrier'
+    """
+    return "" if statement.misses_by is None else _with_unit(statement.misses_by, statement.unit, digits, False)
+
+
+def _with_unit(value: float, unit: str, digits: int, lower: bool) -> str:
+    share = unit == "share"
+    text = _rounded(value, digits, ROUND_FLOOR if lower else ROUND_CEILING, 2 if share else 0)
+    return f"{text} %" if share else f"{text} {unit}".rstrip()
+
+
+def _rounded(value: float, digits: int, mode: str, shift: int = 0) -> str:
+    if not math.isfinite(value):
+        return f"{value:g}"
+    exact = Context(prec=1000).scaleb(Decimal(value), shift)  # a float is a decimal number, of up to 770 digits
+    rounded = Context(prec=digits, rounding=mode).plus(exact)
+    text = f"{float(rounded):.{digits}g}"
+    return text if Decimal(text) == rounded else f"{rounded:e}"
