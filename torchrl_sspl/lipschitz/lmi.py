@@ -12,18 +12,16 @@ from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, NotPositiveDefiniteError, ShapeError
 from torchrl_sspl.functional import lmi_loss, lmi_matrix
+from torchrl_sspl.lipschitz.layers import activation_of, collapsible
 from torchrl_sspl.lipschitz.multipliers import norm_product, start_multipliers
 
-ACTIVATIONS: dict[str, tuple[Callable[[], nn.Module], tuple[float, float]]] = {
-    "relu": (nn.ReLU, (0.0, 1.0)),
-    "leaky_relu": (lambda: nn.LeakyReLU(0.1), (0.1, 1.0)),
-    "tanh": (nn.Tanh, (0.0, 1.0)),
-    "softplus": (nn.Softplus, (0.0, 1.0)),
-    "sigmoid": (nn.Sigmoid, (0.0, 0.25)),
-    "silu": (nn.SiLU, (-0.1, 1.1)),
-}
+ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
+    "relu": nn.ReLU, "leaky_relu": lambda: nn.LeakyReLU(0.1), "tanh": nn.Tanh, "softplus": nn.Softplus,
+    "sigmoid": nn.Sigmoid, "silu": nn.SiLU,
+}  # fmt: skip
 
 
+@collapsible
 class LMIBarrier(nn.Module):
     r"""Network with trainable multipliers whose matrix :math:`M(\theta, \Lambda)` stays positive definite.
 
@@ -68,7 +66,8 @@ class LMIBarrier(nn.Module):
                 f"expected sizes >= 1 with a hidden layer, lipschitz_bound > 0 and 0 < start_ratio < 1, received "
                 f"{sizes}, {lipschitz_bound} and {start_ratio}"
             )
-        make, self.slope = ACTIVATIONS[activation]
+        make = ACTIVATIONS[activation]
+        self.slope = activation_of(make()).slope
         self.latent_dim, self.lipschitz_bound = latent_dim, float(lipschitz_bound)
         layers: list[nn.Module] = []
         for n_in, n_out in itertools.pairwise(sizes):

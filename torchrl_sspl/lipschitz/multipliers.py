@@ -90,21 +90,10 @@ def minimise_bound(
         >>> round(minimise_bound([0.5 * one, one])[1], 3)
         0.5
     """
-    alpha, beta = slope
     weights, units = _balanced(weights)
     sizes = [weights[0].shape[1], *(w.shape[0] for w in weights)]
     total, inputs, hidden = sum(sizes), sizes[0], sum(sizes[1:-1])
-    # M = constant + L^2 I at the input + sum_i lambda_i U_i K U_i^T, U_i = [row i of the weights, unit vector i].
-    before = torch.block_diag(*weights[:-1], weights[0].new_zeros(0, sizes[-2] + sizes[-1]))
-    pairs = torch.stack([before, torch.eye(total, dtype=torch.float64)[inputs : inputs + hidden]], 1)
-    kernel = torch.tensor([[2 * alpha * beta, -(alpha + beta)], [-(alpha + beta), 2.0]], dtype=torch.float64)
-    constant = torch.zeros(total, total, dtype=torch.float64)
-    constant[-sizes[-1] :, -sizes[-1] - sizes[-2] : -sizes[-1]] = -weights[-1]
-    constant = constant + constant.mT
-    constant[-sizes[-1] :, -sizes[-1] :] = torch.eye(sizes[-1], dtype=torch.float64)
-    first = torch.zeros(total, dtype=torch.float64)
-    first[:inputs] = 1.0
-
+    pairs, kernel, constant, first = _pencil(weights, slope)
     bound = 1.05 * max(norm_product(weights, slope), 1e-6)
     levels = start_multipliers(weights, bound, slope)
     lams = torch.cat([torch.full((n,), v, dtype=torch.float64) for n, v in zip(sizes[1:-1], levels, strict=True)])
@@ -139,11 +128,9 @@ def minimise_bound(
             hessian = hessian * scale[:, None] * scale + torch.diag(torch.cat([x[:-1] ** -2, x.new_zeros(1)]))
             spread = hessian.diagonal().rsqrt()
             root, info = torch.linalg.cholesky_ex(hessian * spread[:, None] * spread)
-            if int(info):
-                break  # as accurate as float64 allows
             step = -spread * torch.cholesky_solve((spread * gradient)[:, None], root)[:, 0]
-            if not float(-(gradient @ step)) > 1e-2:
-                break
+            if int(info) or not float(-(gradient @ step)) > 1e-2:
+                break  # as accurate as float64 allows, or as is worth it
             # Along the step the function is linear minus logarithms of 1 + s e: its minimum is found exactly. No step
             # goes near the boundary of the cone, where Newton's method would creep.
             half = torch.linalg.solve_triangular(factor, part(step), upper=False)
@@ -173,6 +160,24 @@ def _balanced(weights: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
             ratio = torch.where((into > 0) & (out > 0), (out / into).sqrt(), torch.ones_like(d))
             weights[k], weights[k + 1], units[k] = weights[k] * ratio[:, None], weights[k + 1] / ratio, d * ratio
     return weights, units
+
+
+def _pencil(weights: Sequence[Tensor], slope: Slope) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    r"""Parts of the matrix, :math:`M = C + L^2 \operatorname{diag}(e) + \sum_i \lambda_i U_i K U_i^\top`: U, K, C and e."""
+    alpha, beta = slope
+    sizes = [weights[0].shape[1], *(w.shape[0] for w in weights)]
+    total, inputs, hidden = sum(sizes), sizes[0], sum(sizes[1:-1])
+    # U_i = [row i of the weights, unit vector i].
+    before = torch.block_diag(*weights[:-1], weights[0].new_zeros(0, sizes[-2] + sizes[-1]))
+    pairs = torch.stack([before, torch.eye(total, dtype=torch.float64)[inputs : inputs + hidden]], 1)
+    kernel = torch.tensor([[2 * alpha * beta, -(alpha + beta)], [-(alpha + beta), 2.0]], dtype=torch.float64)
+    constant = torch.zeros(total, total, dtype=torch.float64)
+    constant[-sizes[-1] :, -sizes[-1] - sizes[-2] : -sizes[-1]] = -weights[-1]
+    constant = constant + constant.mT
+    constant[-sizes[-1] :, -sizes[-1] :] = torch.eye(sizes[-1], dtype=torch.float64)
+    first = torch.zeros(total, dtype=torch.float64)
+    first[:inputs] = 1.0
+    return pairs, kernel, constant, first
 
 
 def _line_minimum(slope: float, rates: Tensor) -> float:

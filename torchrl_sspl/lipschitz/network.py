@@ -3,75 +3,151 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
+from types import NoneType
 
 from torch import Tensor, nn
+from torch.nn.modules import module as torch_module
 
-from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError, StructureError
+from torchrl_sspl.lipschitz.layers import COLLAPSIBLE, FORMS, LAYERS, ORIGINAL, activation_of
 
 Slope = tuple[float, float]
 
-# Smallest and largest slope of each activation, rounded outward.
-_SLOPES: dict[type[nn.Module], Callable[[nn.Module], Slope]] = {
-    nn.Identity: lambda m: (1.0, 1.0),
-    nn.ReLU: lambda m: (0.0, 1.0),
-    nn.LeakyReLU: lambda m: (min(float(m.negative_slope), 1.0), max(float(m.negative_slope), 1.0)),  # type: ignore[arg-type]
-    nn.Tanh: lambda m: (0.0, 1.0),
-    nn.Softplus: lambda m: (0.0, 1.0),
-    nn.Sigmoid: lambda m: (0.0, 0.25),
-    nn.SiLU: lambda m: (-0.1, 1.1),
-    nn.GELU: lambda m: (-0.13, 1.13),
-}
+_CALLS = ("_forward_pre_hooks", "_forward_hooks", "_backward_pre_hooks", "_backward_hooks")
+_CALL = nn.Module.__call__
 
 
-def _flat(module: nn.Module) -> Iterator[nn.Module]:
-    if isinstance(module, nn.Sequential):
-        for part in module:
-            yield from _flat(part)
-    else:
-        yield module
+def check_module(module: nn.Module) -> None:
+    """Refuses a module that may compute something else than its type and its weights say.
+
+    Args:
+        module: a layer, an ``nn.Sequential``, or a module of a registered form (see :mod:`.layers`); its children are not
+            looked at.
+
+    Raises:
+        StructureError: if the type is not exactly one that is known; if a hook (of the module or of all modules), an
+            overridden, replaced or compiled method or a parametrization stands between the weights and what is computed.
+        NonFiniteError: if a weight is NaN or infinite.
+
+    Source: none.
+
+    Example:
+        >>> layer = nn.Linear(2, 1)
+        >>> check_module(layer)
+        >>> layer.forward = lambda x: 0 * x
+        >>> check_module(layer)
+        Traceback (most recent call last):
+        torchrl_sspl.errors.StructureError: expected a Linear whose methods are its own, received one with 'forward' replaced
+    """
+    kind, name = type(module), type(module).__name__
+    known = (*LAYERS, nn.Sequential, *FORMS, *COLLAPSIBLE)
+    if "parametrizations" in module._modules:
+        raise StructureError(f"expected stored weights, received a {name} with a parametrization; remove it", "PARAMETRIZED")
+    if kind not in known:
+        base = next((k for k in kind.__mro__ if k in known), None)
+        if base is None:
+            raise StructureError(
+                "expected a plain network (nn.Sequential of layers of the kinds "
+                f"{', '.join(sorted(k.__name__ for k in LAYERS))}), received {name}; deploy a network made of these"
+            )
+        raise StructureError(
+            f"expected a plain network made of {base.__name__} itself, received its subclass {name}, which may compute "
+            "something else",
+            "SUBCLASSED",
+        )
+    everywhere = (torch_module._global_forward_hooks, torch_module._global_forward_pre_hooks,
+                  torch_module._global_backward_hooks, torch_module._global_backward_pre_hooks)  # fmt: skip
+    if any(everywhere) or any(getattr(module, hooks, None) for hooks in _CALLS):
+        raise StructureError(
+            f"expected layers without forward or backward hooks, received a {name} with one (or one of all modules); a "
+            "hook may change what a layer computes",
+            "HOOKED",
+        )
+    replaced = [k for k in vars(module) if callable(getattr(kind, k, None))]
+    if vars(module).get("_compiled_call_impl") is not None:
+        replaced.append("_compiled_call_impl")
+    if kind.forward is not ORIGINAL.get(kind, kind.forward) or kind.__call__ is not _CALL:
+        replaced.append("forward")
+    if replaced:
+        raise StructureError(
+            f"expected a {name} whose methods are its own, received one with {replaced[0]!r} replaced", "OVERRIDDEN"
+        )
+    if kind is nn.Linear and any(not isinstance(module._parameters.get(k, 0), (nn.Parameter, NoneType)) for k in ("weight", "bias")):
+        raise StructureError(f"expected weights that are parameters, received a {name} whose are not", "PARAMETRIZED")
+    for value in (*module._parameters.values(), *module._buffers.values()):
+        if value is not None and (value.is_meta or not bool(value.isfinite().all())):
+            raise NonFiniteError("expected finite weights, received NaN or infinity; the network cannot be certified")
+
+
+def flat_layers(network: nn.Module) -> list[nn.Module]:
+    """The layers of a plain network in order, after a look at each; those that do nothing are left out.
+
+    Args:
+        network: a layer, an ``nn.Sequential`` of such, possibly nested, or a registered module with a ``collapse()``
+            method that gives one.
+
+    Returns:
+        The layers.
+
+    Raises:
+        StructureError: if one may compute something else than its type and its weights say.
+        NonFiniteError: if a weight is NaN or infinite.
+
+    Source: none.
+
+    Example:
+        >>> [type(layer).__name__ for layer in flat_layers(nn.Sequential(nn.Linear(2, 2), nn.Sequential(nn.ReLU())))]
+        ['Linear', 'ReLU']
+    """
+    check_module(network)
+    if type(network) in COLLAPSIBLE:
+        return flat_layers(network.collapse())  # type: ignore[operator]
+    if type(network) is nn.Sequential:
+        return [layer for part in network for layer in flat_layers(part)]
+    if type(network) in FORMS:
+        raise StructureError(f"expected a plain network, received a {type(network).__name__}; pass its 'net'")
+    return [] if type(network) is nn.Identity else [network]
 
 
 def plain_layers(network: nn.Module) -> tuple[list[nn.Linear], list[Slope]]:
     r"""Linear layers of a plain network, and the slopes of what stands between them.
 
     Args:
-        network: ``nn.Sequential`` of linear layers and activations, possibly nested, or a module with a
-            ``collapse()`` method that gives one.
+        network: see :func:`flat_layers`; linear layers with at most one activation between two of them.
 
     Returns:
         The layers, and one interval of slopes per gap between two layers.
 
     Raises:
-        ConfigError: if the module is anything else: what is proved of its weights would not hold for it.
+        StructureError: if the module is anything else: what is proved of its weights would not hold for it.
+        NonFiniteError: if a weight is NaN or infinite.
 
     Source: none.
 
     Example:
-        >>> plain_layers(nn.Sequential(nn.Linear(2, 8), nn.LeakyReLU(0.1), nn.Linear(8, 1)))[1]
-        [(0.1, 1.0)]
+        >>> plain_layers(nn.Sequential(nn.Linear(2, 8), nn.LeakyReLU(0.5), nn.Linear(8, 1)))[1]
+        [(0.5, 1.0)]
     """
     layers: list[nn.Linear] = []
     slopes: list[Slope] = []
     after_linear = False
-    parts = list(_flat(network.collapse() if hasattr(network, "collapse") else network))  # type: ignore[operator]
+    parts = flat_layers(network)
     for part in parts:
         if isinstance(part, nn.Linear):
             if after_linear:
                 slopes.append((1.0, 1.0))
             layers.append(part)
             after_linear = True
-        elif type(part) in _SLOPES and after_linear:
-            slopes.append(_SLOPES[type(part)](part))
+        elif after_linear:
+            slopes.append(activation_of(part).slope)
             after_linear = False
         else:
-            after_linear = False
             break
     if not after_linear:
-        raise ConfigError(
-            "expected a plain network (linear layers with one activation between two of them, of the kinds "
-            f"{sorted(kind.__name__ for kind in _SLOPES)}), received {[type(p).__name__ for p in parts]}; pass such a "
-            "network, or its weights and the slopes of its activation"
+        raise StructureError(
+            "expected a plain network (linear layers with at most one activation between two of them), received "
+            f"{[type(p).__name__ for p in parts]}; pass such a network, or its weights and the slopes of its activation"
         )
     return layers, slopes
 

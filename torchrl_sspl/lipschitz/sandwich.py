@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.lipschitz.layers import collapsible
 
 # Every weight is made smaller by this share: the matrix of the certificate is then positive definite with a slack
 # that rounding to float32 cannot use up. The bound loses (layers) times as much.
@@ -46,6 +47,7 @@ def cayley(weight: Tensor) -> Tensor:
     return torch.cat([inverse @ (eye - skew), -2.0 * rest @ inverse])
 
 
+@collapsible
 class SandwichBarrier(nn.Module):
     r"""Scalar ReLU network whose Lipschitz constant is at most L for every value of its parameters.
 

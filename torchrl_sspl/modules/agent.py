@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import copy
+import importlib
+import inspect
 import json
+import operator
+import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,6 +20,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.lipschitz import prove_lipschitz
 from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
 
@@ -94,6 +100,56 @@ class Agent(nn.Module):
         self.description: dict[str, Any] = dict(description or {})
         self.eval()
         self.requires_grad_(False)
+
+    @classmethod
+    def from_networks(
+        cls,
+        encoder: nn.Module,
+        dynamics: nn.Module,
+        barrier: nn.Module,
+        policy: nn.Module,
+        *,
+        level: float = 0.0,
+        description: dict[str, Any] | None = None,
+    ) -> Agent:
+        """A frozen copy of networks in training, the barrier collapsed to a plain network, its bound proved.
+
+        Args:
+            encoder, dynamics, policy: networks, which stay as they are; TensorDictModules are unwrapped.
+            barrier: a Lipschitz barrier of this library.
+            level: {B <= level} becomes {B <= 0}.
+            description: whatever should travel with the agent.
+
+        Returns:
+            The agent, on the CPU; it can be saved.
+
+        Source: none.
+
+        Example:
+            >>> from torchrl_sspl.lipschitz import SandwichBarrier
+            >>> nets = FrameEncoder(2, 32), LatentDynamics(2, 1), SandwichBarrier(2, (8,), 1.5), Policy(2, 1)
+            >>> Agent.from_networks(*nets).lipschitz_bound
+            1.5
+        """
+        nets = [copy.deepcopy(getattr(net, "module", net)).cpu() for net in (encoder, dynamics, barrier, policy)]
+        deployed, bound = nets[2].collapse(), float(nets[2].lipschitz_bound)  # type: ignore[arg-type, operator]
+        with torch.no_grad():
+            deployed[-1].bias.sub_(level)
+        witness = [m.tolist() for m in nets[2].multipliers()]  # type: ignore[operator]
+        proof = prove_lipschitz(deployed, bound, multipliers=[torch.tensor(m) for m in witness])
+        hidden = [layer.out_features for layer in deployed if isinstance(layer, nn.Linear)][:-1]
+        named = {"encoder": nets[0], "dynamics": nets[1], "policy": nets[3]}
+        networks = {k: _describe(net, int(nets[1].latent_dim)) for k, net in named.items()}  # type: ignore[arg-type]
+        body = dict(description or {})
+        body["networks"] = {**networks, "barrier": {"latent_dim": int(nets[1].latent_dim), "hidden": hidden}}  # type: ignore[arg-type]
+        body["lipschitz"] = {"proved": proof.proved, "reason": proof.reason, "multipliers": witness}
+        return cls(nets[0], nets[1], deployed, nets[3], bound, body)
+
+    @classmethod
+    def from_loss(cls, loss: Any, *, level: float = 0.0, description: dict[str, Any] | None = None) -> Agent:
+        """A frozen copy of the networks of an ``SSPLLoss``; arguments as for :meth:`from_networks`."""
+        nets = loss.encoder, loss.dynamics, loss.barrier, loss.actor_network
+        return cls.from_networks(*nets, level=level, description=description)
 
     @torch.no_grad()
     def encode(self, pixels: Tensor) -> Tensor:
@@ -234,14 +290,113 @@ def hosted(agent: Agent) -> Agent:
     return Agent(_Elsewhere(agent.encoder, device), dynamics, barrier, policy, agent.lipschitz_bound, agent.description)
 
 
+def build_encoder(name: str, **sizes: Any) -> nn.Module:
+    """An encoder of the library by name, or one of your own by import path.
+
+    Args:
+        name: key of :data:`ENCODERS`, or ``"package.module:Class"``.
+        **sizes: those that the class takes are handed on: ``latent_dim``, ``image_size``, ``pool_to``, ...
+
+    Returns:
+        The encoder.
+
+    Raises:
+        ConfigError: if there is no such encoder, or it needs something else.
+
+    Source: none.
+
+    Example:
+        >>> build_encoder("FrameEncoder", latent_dim=3, pool_to=16).latent_dim
+        3
+    """
+    try:
+        kind = ENCODERS.get(name) or resolve(name)
+    except ConfigError as error:
+        raise ConfigError(f"expected network.encoder to be one of {sorted(ENCODERS)} or package.module:Class, {error}") from error
+    return call_with(kind, sizes)
+
+
+def call_with(kind: Any, sizes: dict[str, Any]) -> nn.Module:
+    """A class or function called with those of the sizes that it takes.
+
+    Raises:
+        ConfigError: if it is a module already, or needs something else.
+    """
+    if isinstance(kind, nn.Module) or not callable(kind):
+        found = f"a module; give its class, {type(kind).__name__}" if isinstance(kind, nn.Module) else f"a {type(kind).__name__}"
+        raise ConfigError(f"encoder: expected a class or a function latent_dim -> module, received {found}")
+    taken = inspect.signature(kind).parameters
+    if any(p.kind is p.VAR_KEYWORD for p in taken.values()) and "latent_dim" in taken:
+        chosen = sizes
+    elif "latent_dim" in taken:
+        chosen = {k: v for k, v in sizes.items() if k in taken}
+    else:  # whatever it calls it, the size of the latent comes first
+        chosen = {}
+    try:
+        made = kind(**chosen) if chosen else kind(sizes["latent_dim"])
+    except TypeError as error:
+        raise ConfigError(
+            f"encoder: expected a class or a function latent_dim -> module, received one that raises TypeError: {error}"
+        ) from error
+    if not getattr(made, "arguments", None):
+        made.arguments = chosen or {"latent_dim": sizes["latent_dim"]}  # with which it is built again
+    return made
+
+
+def resolve(path: str) -> Any:
+    """What an import path names.
+
+    Args:
+        path: ``"package.module:name"`` or ``"package.module.name"``; the working directory is searched too.
+
+    Returns:
+        The object.
+
+    Raises:
+        ConfigError: if there is no such module, or no such name in it.
+
+    Source: none.
+
+    Example:
+        >>> resolve("torchrl_sspl.sets:SAFE")
+        1
+    """
+    module, sign, name = path.partition(":")
+    if not sign:
+        module, _, name = path.rpartition(".")
+    sys.path.append(os.getcwd())
+    try:
+        return operator.attrgetter(name)(importlib.import_module(module))
+    except (ImportError, ValueError, AttributeError) as error:
+        raise ConfigError(
+            f"expected an import path like package.module:name, received '{path}' ({type(error).__name__}: {error}); "
+            "run from the folder that holds the module, or install it"
+        ) from error
+    finally:
+        sys.path.remove(os.getcwd())
+
+
+def _describe(network: nn.Module, latent_dim: int) -> dict[str, Any]:
+    """Class and arguments from which a network can be built again."""
+    kind = type(network)
+    own, module = {**ENCODERS, **DYNAMICS, **POLICIES}.get(kind.__name__) is not kind, kind.__module__
+    if module == "__main__":  # of a program: others find the class in its file
+        module = Path(getattr(sys.modules[module], "__file__", None) or module).stem
+    arguments = getattr(network, "arguments", None) or {"latent_dim": latent_dim}
+    return {"class": f"{module}:{kind.__qualname__}" if own else kind.__name__, "arguments": arguments}
+
+
 def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any]) -> nn.Module:
     name = spec["class"]
-    if name not in registry:
+    if name not in registry and ":" not in name:
         raise CheckpointError(
-            f"expected one of the networks {sorted(registry)}, received '{name}'; add it to the registries of "
-            "torchrl_sspl.modules.agent before loading"
+            f"expected one of the networks {sorted(registry)}, received '{name}'; name a network of your own as "
+            "package.module:Class, or add it to the registries of torchrl_sspl.modules.agent before loading"
         )
-    return registry[name](**spec["arguments"])
+    try:
+        return registry[name](**spec["arguments"]) if name in registry else call_with(resolve(name), spec["arguments"])
+    except ConfigError as error:
+        raise CheckpointError(f"the network '{name}' cannot be built: {error}") from error
 
 
 def load(name_or_path: str | Path, device: torch.device | str = "cpu") -> Agent:
@@ -273,17 +428,23 @@ def agent_directory(name_or_path: str | Path) -> Path:
         The directory with ``agent.json``.
 
     Raises:
-        CheckpointError: if there is none.
+        CheckpointError: if there is none, or a shipped agent and a folder here have the same name.
 
     Source: none.
     """
     shipped = Path(__file__).resolve().parent.parent / "agents"
     candidates = [Path(name_or_path), Path(name_or_path) / "agent"]
+    found = [d for d in candidates if (d / DESCRIPTION_FILE).is_file()]
     if isinstance(name_or_path, str) and name_or_path.isidentifier():
-        candidates.insert(0, shipped / name_or_path)
-    for directory in candidates:
-        if (directory / DESCRIPTION_FILE).is_file():
-            return directory
+        named = shipped / name_or_path
+        if (named / DESCRIPTION_FILE).is_file() and found and not found[0].samefile(named):
+            raise CheckpointError(
+                f"'{name_or_path}' is a shipped agent and a folder here: give ./{name_or_path} for the folder, or start "
+                "elsewhere"
+            )
+        found += [named] if (named / DESCRIPTION_FILE).is_file() else []
+    if found:
+        return found[0]
     names = sorted(p.name for p in shipped.iterdir() if (p / DESCRIPTION_FILE).is_file()) if shipped.is_dir() else []
     raise CheckpointError(
         f"expected the name of a shipped agent ({', '.join(names) or 'none is shipped'}) or a run directory with "

@@ -128,6 +128,8 @@ class MomentEncoder(FrameEncoder):
         )
         self.trunk = nn.Sequential(ColourMoments(pool_to, self.in_channels, latent_dim))
         self.gain = nn.Parameter(torch.tensor(0.6))
+        kept = ("latent_dim", "image_size", "velocity_gain", "hidden")
+        self.arguments = {**{k: self.arguments[k] for k in kept}, "pool_to": pool_to}
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
+from torchrl_sspl.lipschitz.layers import known_form
 
 
 class _InwardClamp(torch.autograd.Function):
@@ -161,6 +162,12 @@ class FrameEncoder(nn.Module):
         self.features = _positive(features, "features")
         self.velocity_gain = float(velocity_gain)
         self.in_channels = _positive(in_channels, "in_channels")
+        #: How to build it again; travels with an agent.
+        self.arguments: dict[str, Any] = {
+            "latent_dim": latent_dim, "image_size": image_size if self.image_size is None else list(self.image_size),
+            "pool_to": list(self.pool_to), "channels": list(channels), "features": features, "hidden": hidden,
+            "velocity_gain": self.velocity_gain, "in_channels": in_channels,
+        }  # fmt: skip
         layers: list[nn.Module] = []
         height, width, previous = *self.pool_to, self.in_channels
         for size in channels:
@@ -218,7 +225,7 @@ class FrameEncoder(nn.Module):
         flat = frames.reshape(-1, *frames.shape[-3:])
         if flat.device.type == "cpu" and not torch.compiler.is_compiling():
             # A few frames at a time stay in the cache: more than twice as fast, the same numbers.
-            pooled = torch.cat([self._pool(part.to(dtype)) / 127.5 - 1.0 for part in flat.split(32)])
+            pooled = torch.cat([self._pool_bytes(part, dtype) / 127.5 - 1.0 for part in flat.split(32)])
         else:
             pooled = self._pool(flat.to(dtype)) / 127.5 - 1.0
         return self.trunk(pooled).reshape(*batch, self.features)
@@ -231,6 +238,22 @@ class FrameEncoder(nn.Module):
         # The same average as the adaptive pooling, several times faster.
         kernel = (height // self.pool_to[0], width // self.pool_to[1])
         return frames if kernel == (1, 1) else F.avg_pool2d(frames, kernel)
+
+    def _pool_bytes(self, frames: Tensor, dtype: torch.dtype) -> Tensor:
+        """The same average of uint8 frames, summed in integers: several times faster, and exact as the average itself is."""
+        (n, c, height, width), (rows, columns) = frames.shape, self.pool_to
+        k, m = height // rows, width // columns
+        if height % rows or width % columns or k > 128 or k * m == 1:  # 128 rows of 255 are the most that 16 bits hold
+            return self._pool(frames.to(dtype))
+        parts = frames.reshape(n, c, rows, k, width)
+        line = parts[:, :, :, 0].to(torch.int16)
+        for i in range(1, k):
+            line += parts[:, :, :, i]
+        cells = line.reshape(n, c, rows, columns, m)
+        total = cells[..., 0].to(dtype)
+        for i in range(1, m):
+            total += cells[..., i]
+        return total / (k * m)
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
         """Latent from the features of two successive frames.
@@ -307,6 +330,7 @@ class FrameEncoder(nn.Module):
         return self.sequence(stacked).squeeze(-2)
 
 
+@known_form("residual")
 class LatentDynamics(nn.Module):
     r"""Predicts the next latent from latent and action, on the bounded domain.
 
@@ -346,6 +370,8 @@ class LatentDynamics(nn.Module):
         # A constant, not a statistic: nothing that a target network would have to follow.
         self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
         self.net = _mlp((latent_dim + action_dim, *hidden, latent_dim))
+        sizes = {"latent_dim": latent_dim, "action_dim": action_dim, "hidden": list(hidden)}
+        self.arguments: dict[str, Any] = {**sizes, "action_scale": self.action_scale.flatten().tolist()}
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
         """Next latent.
@@ -371,6 +397,7 @@ class LatentDynamics(nn.Module):
         return inward_clamp(latent + self.net(torch.cat([latent, action / self.action_scale], -1)))
 
 
+@known_form("bounded")
 class Policy(nn.Module):
     r"""Deterministic bounded policy on latents.
 
@@ -409,6 +436,8 @@ class Policy(nn.Module):
         self.action_dim = _positive(action_dim, "action_dim")
         self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
         self.net = _mlp((latent_dim, *hidden, action_dim))
+        sizes = {"latent_dim": latent_dim, "action_dim": action_dim, "hidden": list(hidden)}
+        self.arguments: dict[str, Any] = {**sizes, "action_scale": self.action_scale.flatten().tolist()}
 
     def forward(self, latent: Tensor) -> Tensor:
         """Action.
