@@ -7,5 +7,15 @@ from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.envs.pendulum import PendulumEnv
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
+from torchrl_sspl.envs.system import Requirement, System
 
-__all__ = ["DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "PendulumEnv", "PendulumRenderer", "SafetyEnv"]
+__all__ = [
+    "DubinsEnv",
+    "GymnasiumPixels",
+    "GymnasiumRenderer",
+    "PendulumEnv",
+    "PendulumRenderer",
+    "Requirement",
+    "SafetyEnv",
+    "System",
+]

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import gymnasium
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
@@ -14,6 +15,7 @@ from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_sspl.devices import usable_device
+from torchrl_sspl.envs.system import System
 from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
 from torchrl_sspl.sets import UNSAFE, Region, check_disjoint, label
 
@@ -50,6 +52,8 @@ class SafetyEnv(EnvBase):
     """A batched system with labelled regions that is seen through two consecutive frames.
 
     A subclass gives the physics and the picture: ``dynamics``, ``wrap``, ``previous_state`` and ``draw``.
+    What else is particular to it (names, units, requirements, another renderer, a full physics) are ``system``,
+    ``renderers``, ``known_twin`` and ``physics``, all with defaults.
     This class gives the TorchRL environment. Output keys, for ``batch_size=[n]``:
 
     ========== ============================== ============================================================
@@ -142,6 +146,24 @@ class SafetyEnv(EnvBase):
     @abstractmethod
     def draw(self, state: Tensor) -> Tensor:
         """One RGB frame per state, uint8 ``(n, 3, H, W)``."""
+
+    @property
+    def system(self) -> System:
+        """Names and units of state and action, requirements, sizes of grids; by default without any of them."""
+        names = tuple(f"x{k}" for k in range(self.state_dim))
+        return System(f"{type(self).__name__.removesuffix('Env')} from pixels", names, "action")
+
+    def renderers(self) -> dict[str, Callable[[Tensor], Tensor]]:
+        """Further renderers by name, states ``(n, state_dim)`` -> uint8 ``(n, 3, H, W)``, on which agents are evaluated too."""
+        return {}
+
+    def known_twin(self) -> SafetyEnv:
+        """System of the same kind whose true kernel is computed, against which its agents are evaluated."""
+        return self
+
+    def physics(self) -> Callable[[], gymnasium.Env] | None:
+        """Maker of the same system in full physics, with the same regions and actions; None where there is none."""
+        return None
 
     # -- what follows from it --------------------------------------------------------------------------
 

@@ -2,20 +2,43 @@
 
 from __future__ import annotations
 
+import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import gymnasium
 import torch
 from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
 from torchrl_sspl.envs.quadruped.compositor import TopViewCompositor
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.envs.system import Requirement, System
+from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.sets import SAFE, Box, Region
 
 OBSTACLE_SHAPES = ("square", "disc")
 YAW_LAG = (0.048, 0.063)
 """Turn of the walking robot in one step per yaw rate commanded now and one step before, in s."""
+REQUIREMENTS = (
+    Requirement("walks_from_safe_hit", "walks from S that hit the obstacle or enter U", "<=", 0.0, 0.0),
+    Requirement("walks_from_safe_fall", "walks from S that fall", "<=", 0.0, 0.0),
+    Requirement("walks_from_set_enter", "walks from {B <= 0} that enter U", "<=", 0.01, 0.0),
+    Requirement("safe_rollouts_touch_unsafe", "Dubins episodes from {B <= 0} that enter U", "<=", 0.001, 0.0),
+    Requirement("volume_over_kernel", "volume of {B <= 0} over the true kernel", ">=", 0.7, 0.95),
+    Requirement("false_safe_of_doomed", "doomed states outside U with B <= 0", "<=", 0.2, 0.01),
+    Requirement("unsafe_called_safe", "grid of U with B <= 0", "<=", 0.0, 0.0),
+    Requirement("training_minutes", "training time [min]", "<=", 60.0, 25.0),
+    Requirement("latency_p99", "policy latency per frame, 99th percentile [ms]", "<=", 10.0, 5.0),
+)
+_LATE = (
+    "The certificate and the training are about the Dubins car that turns as late as the walking robot does; the true "
+    "kernel, and the Dubins episodes in the table, are those of the car that turns at once."
+)
+_PHYSICS = (
+    "What the robot does in full physics is measured by its walks. There position and heading alone do not determine the "
+    "next step; the lag enters as an error that the set tolerates."
+)
 
 
 class Disc(Region):
@@ -41,6 +64,9 @@ class Disc(Region):
         check_positive(radius=radius)
         self.centre, self.radius, self.rest = torch.tensor([float(v) for v in centre]), float(radius), rest
         self.dim = 2 if rest is None else 2 + rest.dim
+        #: Corners of the box around it.
+        ends = (torch.zeros(0), torch.zeros(0)) if rest is None else (rest.low, rest.high)
+        self.low, self.high = torch.cat([self.centre - self.radius, ends[0]]), torch.cat([self.centre + self.radius, ends[1]])
 
     def outside(self, state: Tensor) -> Tensor:
         """Distance in m to the disc, negative inside, ``(*batch, dim) -> (*batch,)``."""
@@ -197,6 +223,52 @@ class DubinsEnv(SafetyEnv):
         self._compositor = TopViewCompositor(
             image_size, obstacle=obstacle, half_view=1.2 * arena_half_size, device=self.device
         )
+
+    @property
+    def system(self) -> System:
+        """Place, heading, yaw rate, and what an agent has to reach; with a yaw lag the last command too."""
+        late = self.yaw_lag is not None
+        return System(
+            title="Quadruped: an obstacle, from pixels",
+            state_names=("x [m]", "y [m]", "heading [rad]", *(("last yaw rate [rad/s]",) if late else ())),
+            action_name="yaw rate [rad/s]",
+            requirements=REQUIREMENTS,
+            state_grid=(61, 61, 37, *((5,) if late else ())),
+            kernel_grid=(101, 101, 72, *((9,) if late else ())),
+            unsafe_grid=(61, 61, 36, *((5,) if late else ())),
+            notes=(f"{_LATE} {_PHYSICS}" if late else _PHYSICS,),
+        )
+
+    def known_twin(self) -> DubinsEnv:
+        """The same car without a yaw lag: its true kernel has three dimensions."""
+        if self.yaw_lag is None:
+            return self
+        return DubinsEnv(self.batch_size, horizon=self.horizon, device=self.device, seed=0, **self._geometry())
+
+    def physics(self) -> Callable[[], gymnasium.Env]:
+        """Maker of the walking robot with the same obstacle, regions, speed and actions.
+
+        Raises:
+            MissingDependencyError: the simulator is not installed.
+
+        Source: paper, Section IV-B.
+        """
+        try:
+            importlib.import_module("pybullet")
+            from torchrl_sspl.envs.quadruped.env import QuadrupedEnv
+        except ImportError as error:
+            raise MissingDependencyError(
+                f"full physics: expected the simulator, received {error}; pip install 'torchrl-sspl[quadruped]'."
+            ) from error
+        return lambda: QuadrupedEnv(**self._geometry())
+
+    def _geometry(self) -> dict[str, Any]:
+        """What this car, its twin and the robot in full physics have in common, as keyword arguments of theirs."""
+        names = (
+            "max_yaw_rate", "speed", "dt", "image_size", "arena_half_size", "safe_half_size", "unsafe_half_size",
+            "obstacle_shape", "obstacle_half_size", "obstacle_centre",
+        )  # fmt: skip
+        return {name: getattr(self, name) for name in names}
 
     @staticmethod
     def _obstacle(shape, centre, unsafe_half_size, half_size, square) -> tuple[Region, Region]:

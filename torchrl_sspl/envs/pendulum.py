@@ -4,17 +4,34 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
+from torchrl_sspl.envs.system import Requirement, System
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.sets import Box, Region
 
 INTEGRATORS = ("semi_implicit", "explicit")
+SYSTEM = System(
+    title="Inverted pendulum from pixels",
+    state_names=("angle [rad]", "angular velocity [rad/s]"),
+    action_name="torque [N m]",
+    action_direction=(0.0, 1.0),
+    requirements=(
+        Requirement("unsafe_called_safe", "grid of U with B <= 0", "<=", 0.0, 0.0),
+        Requirement("safe_called_unsafe", "S with B > 0", "<=", 0.0, 0.0),
+        Requirement("volume_over_kernel", "volume of {B <= 0} over the true kernel", ">=", 0.5, 0.9),
+        Requirement("false_safe", "{B <= 0} outside the true kernel", "<=", 0.01, 0.0),
+        Requirement("safe_rollouts_touch_unsafe", "episodes from {B <= 0} that touch U", "<=", 0.0, 0.0),
+        Requirement("safe_rollouts_leave", "episodes from {B <= 0} that leave it", "<=", 0.001, 0.0),
+        Requirement("unsafe_rollouts_return", "recoverable starts in U that come back", ">=", 0.95, 1.0),
+        Requirement("lipschitz_ratio", "sampled over certified Lipschitz constant", ">=", 0.5, 0.95),
+    ),
+)
 
 
 class PendulumEnv(SafetyEnv):
@@ -162,6 +179,15 @@ class PendulumEnv(SafetyEnv):
     def draw(self, state: Tensor) -> Tensor:
         """RGB frames of states, ``(*batch, 2) -> uint8 (*batch, 3, H, W)``."""
         return self.render_frame(state[..., 0])
+
+    @property
+    def system(self) -> System:
+        """Angle, angular velocity, torque, and what an agent has to reach."""
+        return SYSTEM
+
+    def renderers(self) -> dict[str, Callable[[Tensor], Tensor]]:
+        """Gymnasium's own pictures, see ``observe_gymnasium``; drawing raises ``MissingDependencyError`` without pygame."""
+        return {"gymnasium": lambda state: _gymnasium_renderer(self.image_size)(state[..., 0])}
 
     def render_frame(self, angle: Tensor) -> Tensor:
         """RGB frames of angles, ``(n,)`` rad -> uint8 ``(n, 3, H, W)``; see ``PendulumRenderer``."""

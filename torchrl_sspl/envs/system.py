@@ -1,0 +1,83 @@
+"""What is particular to a system: names and units for people, what its agents have to reach, sizes of its grids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """One row of a table of requirements.
+
+    Attributes:
+        name: name of the measurement.
+        label: what it is, for people.
+        sense: "<=" or ">=".
+        must: value that has to be reached.
+        aim: value that one would like to reach.
+
+    Source: none.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> half = SimpleNamespace(measurements={"share": SimpleNamespace(value=0.5)})
+        >>> Requirement("share", "share that leaves", "<=", 0.4, 0.0).verdict(half)
+        'missed by 0.1'
+    """
+
+    name: str
+    label: str
+    sense: str
+    must: float
+    aim: float
+
+    def verdict(self, evaluation: Any) -> str:
+        """"aim", "must", "missed by x" or "not measured", of an evaluation with ``measurements`` by name."""
+        measured = evaluation.measurements.get(self.name)
+        if measured is None or measured.value is None:
+            return "not measured"
+        sign = 1.0 if self.sense == "<=" else -1.0
+        if sign * (measured.value - self.aim) <= 0:
+            return "aim"
+        miss = sign * (measured.value - self.must)
+        return "must" if miss <= 0 else f"missed by {miss:.3g}"
+
+
+@dataclass(frozen=True)
+class System:
+    """Everything about a system that evaluations and reports need beyond its dynamics, regions and pictures.
+
+    Attributes:
+        title: title of its reports.
+        state_names: name and unit of every state coordinate.
+        action_name: name and unit of the action.
+        requirements: what its agents have to reach.
+        state_grid: nodes per state coordinate of the evaluation's grid, corners included (of a periodic coordinate the last
+            node is the first again): one number, or one for each.
+        kernel_grid: nodes per state coordinate of the grid of the true kernel.
+        unsafe_grid: nodes per state coordinate of a grid of its own over U, a periodic coordinate without its last node; None:
+            the nodes of ``state_grid`` in U.
+        action_direction: direction of a positive action in the plane of the first two coordinates (a torque pushes the
+            angular velocity: ``(0, 1)``), for figures; None: along the path.
+        notes: what a report has to say about this system.
+
+    Source: none.
+
+    Example:
+        >>> System("Cart", ("place [m]", "speed [m/s]"), "force [N]", action_direction=(0.0, 1.0)).state_grid
+        201
+    """
+
+    title: str
+    state_names: tuple[str, ...]
+    action_name: str
+    requirements: tuple[Requirement, ...] = ()
+    state_grid: tuple[int, ...] | int = 201
+    kernel_grid: tuple[int, ...] | int = 301
+    unsafe_grid: tuple[int, ...] | None = None
+    action_direction: tuple[float, float] | None = None
+    notes: tuple[str, ...] = ()
+
+
+__all__ = ["Requirement", "System"]
