@@ -1,0 +1,32 @@
+"""One configuration tree: documented dataclasses, presets as files, one reader of key=value."""
+
+from torchrl_sspl.configs.reader import EnvFactory, compose, load, save
+from torchrl_sspl.configs.schema import (
+    BufferConfig,
+    CollectorConfig,
+    Config,
+    EvaluationConfig,
+    LoggerConfig,
+    LossConfig,
+    NetworkConfig,
+    OptimConfig,
+    SynthesisConfig,
+    TrainerConfig,
+)
+
+__all__ = [
+    "BufferConfig",
+    "CollectorConfig",
+    "Config",
+    "EnvFactory",
+    "EvaluationConfig",
+    "LoggerConfig",
+    "LossConfig",
+    "NetworkConfig",
+    "OptimConfig",
+    "SynthesisConfig",
+    "TrainerConfig",
+    "compose",
+    "load",
+    "save",
+]
