@@ -31,6 +31,19 @@ class ConfigError(SSPLError, ValueError):
     """A configuration value or key is not valid."""
 
 
+class StructureError(ConfigError):
+    """A network may compute something else than its layers say.
+
+    Args:
+        message: what was expected and received.
+        reason: name of a ``certification.certificate.Reason``.
+    """
+
+    def __init__(self, message: str, reason: str = "NOT_UNDERSTOOD") -> None:
+        super().__init__(message)
+        self.reason = reason
+
+
 class CheckpointError(SSPLError, RuntimeError):
     """A checkpoint, a run directory or a shipped agent cannot be read."""
 

@@ -273,6 +273,38 @@ class Union(Region):
         return torch.cat([p.sample(int((which == k).sum()), generator, device) for k, p in enumerate(self.parts)])
 
 
+class Mixture(Union):
+    """Union of regions from which states are drawn in given shares.
+
+    Args:
+        parts (sequence of Region): regions of the same dimension.
+        shares (sequence of float): how often each is drawn from, not negative, not all zero.
+
+    Raises:
+        ConfigError: the shares do not fit the parts.
+
+    Source: none.
+
+    Example:
+        >>> left, right = Box([-1.0], [0.0]), Box([1.0], [2.0])
+        >>> drawn = Mixture([left, right], [1, 3]).sample(400, torch.Generator().manual_seed(0))
+        >>> 0.7 < float((drawn > 0).float().mean()) < 0.8
+        True
+    """
+
+    def __init__(self, parts: Sequence[Region], shares: Sequence[float]) -> None:
+        if len(parts) != len(shares) or min(shares, default=-1) < 0 or not sum(shares) > 0:
+            raise ConfigError(f"shares: expected one share >= 0 for each of {len(parts)} regions, received {list(shares)}.")
+        kept = [(part, float(share)) for part, share in zip(parts, shares, strict=True) if share > 0]
+        super().__init__(*(part for part, _ in kept))
+        self.shares = torch.tensor([share for _, share in kept])
+
+    def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Samples in the given shares, grouped by part; arguments as for :meth:`Region.sample`."""
+        which = torch.multinomial(self.shares.to(device or "cpu"), n, True, generator=generator) if n else torch.zeros(0)
+        return torch.cat([p.sample(int((which == k).sum()), generator, device) for k, p in enumerate(self.parts)])
+
+
 def label(state: Tensor, safe: Region, unsafe: Region) -> Tensor:
     """Region codes of states: 0 unlabelled, 1 safe, 2 unsafe (unsafe wins where both claim a state).
 

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 
@@ -53,6 +54,58 @@ class RandomActions(TensorDictModuleBase):
         shape = (*tensordict.batch_size, *self._low.shape)
         unit = torch.rand(shape, generator=self._generator, device=self._low.device)
         return tensordict.set("action", self._low + unit * (self._high - self._low))
+
+    def get_extra_state(self) -> Tensor:
+        """State of the generator: a collector that goes on draws what it would have drawn."""
+        return torch.zeros(0, dtype=torch.uint8) if self._generator is None else self._generator.get_state()
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Restores what ``get_extra_state`` returned."""
+        self._generator = torch.Generator(device=self._low.device) if len(state) else None
+        if self._generator is not None:
+            self._generator.set_state(state.cpu().clone())
+
+
+class ExploringPolicy(TensorDictModuleBase):
+    """Rollout policy that explores: noise on its actions, and random actions in some of the environments.
+
+    Whole episodes are random or follow the policy: what the policy leads to, such as standing still, is not seen when
+    every other action is random.
+
+    Args:
+        policy: pixels -> ``"action"``.
+        low, high: bounds of the action ``(action_dim,)``.
+        exploration: standard deviation of the noise, as a share of the half range.
+        random_share: share of the environments with uniformly random actions; of a single one, share of the steps.
+
+    Source: none.
+    """
+
+    low: Tensor
+    high: Tensor
+
+    def __init__(
+        self, policy: nn.Module, low: Tensor, high: Tensor, exploration: float, random_share: float
+    ) -> None:
+        super().__init__()
+        self.in_keys, self.out_keys = ["pixels"], ["action"]
+        self.policy, self.exploration, self.random_share = policy, exploration, random_share
+        self.register_buffer("low", low.clone())
+        self.register_buffer("high", high.clone())
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``"action"`` ``(*batch, action_dim)``."""
+        action = self.policy(tensordict.select("pixels"))["action"]
+        half = (self.high - self.low) / 2
+        noisy = action + self.exploration * half * torch.randn_like(action)
+        uniform = self.low + (self.high - self.low) * torch.rand_like(action)
+        n = action.shape[0] if action.ndim > 1 else 1
+        if n > 1:
+            swap = (torch.arange(n, device=action.device) < round(self.random_share * n)).reshape(-1, *[1] * (action.ndim - 1))
+        else:
+            swap = torch.rand_like(action[..., :1]) < self.random_share
+        return tensordict.set("action", torch.where(swap, uniform, noisy.clamp(self.low, self.high)))
 
 
 def collect_random(
@@ -293,4 +346,4 @@ def _starting_in(env: Any, region: Region | None) -> Iterator[None]:
         env.initial_set = before
 
 
-__all__ = ["BACKENDS", "RandomActions", "collect_random", "collect_rollouts", "make_collector"]
+__all__ = ["BACKENDS", "ExploringPolicy", "RandomActions", "collect_random", "collect_rollouts", "make_collector"]

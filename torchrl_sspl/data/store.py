@@ -129,7 +129,7 @@ class TransitionStore(Storage):
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
         """Write transitions at given positions (the interface of ``Storage``)."""
-        index = self._positions(cursor, self.max_size)
+        index = _positions(cursor, self.max_size)
         data = data.reshape(-1)
         if index.numel() != data.shape[0]:
             raise ShapeError(f"store: expected {index.numel()} transitions, received {data.shape[0]}.")
@@ -137,7 +137,7 @@ class TransitionStore(Storage):
             index, data = index[-self.max_size :], data[-self.max_size :]
         if not index.numel():
             return
-        now, then = self._observations(data)
+        now, then = _observations(data)
         columns = self._rows(data)
         if set_cursor:
             self._set_last_cursor(index)
@@ -156,22 +156,6 @@ class TransitionStore(Storage):
         self._len = max(self._len, int(index.max()) + 1)
         self._by_region = {}
         self._bump_mutation_revision()
-
-    def _observations(self, data: TensorDictBase) -> tuple[Tensor, Tensor]:
-        pixels, following = data.get("pixels", None), data.get(("next", "pixels"), None)
-        if pixels is None or following is None:
-            raise ShapeError("store: expected 'pixels' and ('next', 'pixels'), found not both.")
-        for name, value in (("pixels", pixels), ("next pixels", following)):
-            if value.dtype != torch.uint8:
-                raise DTypeError(f"{name}: expected uint8, received {value.dtype}; keep frames unconverted.")
-            if value.ndim != 4 or value.shape[1] != 6:
-                raise ShapeError(f"{name}: expected shape (n, 6, H, W), received {tuple(value.shape)}.")
-        if not torch.equal(pixels[:, 3:], following[:, :3]):
-            raise ConfigError(
-                "store: expected ('next', 'pixels') to begin with the second frame of 'pixels', received "
-                "other frames; stack two consecutive frames."
-            )
-        return pixels.cpu(), following.cpu()
 
     def _store_frames(self, now: Tensor, then: Tensor) -> Tensor:
         """Store the frames of transitions, each once; returns the frame numbers ``(n, 3)``."""
@@ -210,7 +194,7 @@ class TransitionStore(Storage):
     def get(self, index: Any) -> TensorDict:
         """Transitions at given positions: an integer, a slice, or an integer tensor."""
         single = isinstance(index, int) or (isinstance(index, Tensor) and index.ndim == 0)
-        rows = self._positions(index, self._len)
+        rows = _positions(index, self._len)
         if rows.numel() and (int(rows.max()) >= self._len or int(rows.min()) < 0):
             raise ConfigError(f"store: expected positions below {self._len}, received {int(rows.max())}.")
         column = {name: values[rows] for name, values in self._columns.items()}
@@ -268,12 +252,6 @@ class TransitionStore(Storage):
         )
         made.writer._cursor = self._cursor  # go on behind what the store holds already
         return made
-
-    @staticmethod
-    def _positions(index: Any, size: int) -> Tensor:
-        if isinstance(index, slice):
-            return torch.arange(*index.indices(size))
-        return torch.as_tensor(index, dtype=torch.int64).reshape(-1).cpu()
 
     # -- saving ----------------------------------------------------------------------------------------
 
@@ -346,6 +324,30 @@ class TransitionStore(Storage):
         """Whether positions hold a transition."""
         index = torch.as_tensor(item)
         return (index >= 0) & (index < self._len)
+
+
+def _positions(index: Any, size: int) -> Tensor:
+    if isinstance(index, slice):
+        return torch.arange(*index.indices(size))
+    return torch.as_tensor(index, dtype=torch.int64).reshape(-1).cpu()
+
+
+def _observations(data: TensorDictBase) -> tuple[Tensor, Tensor]:
+    """Present and next observation of transitions, after a look at them."""
+    pixels, following = data.get("pixels", None), data.get(("next", "pixels"), None)
+    if pixels is None or following is None:
+        raise ShapeError("store: expected 'pixels' and ('next', 'pixels'), found not both.")
+    for name, value in (("pixels", pixels), ("next pixels", following)):
+        if value.dtype != torch.uint8:
+            raise DTypeError(f"{name}: expected uint8, received {value.dtype}; keep frames unconverted.")
+        if value.ndim != 4 or value.shape[1] != 6:
+            raise ShapeError(f"{name}: expected shape (n, 6, H, W), received {tuple(value.shape)}.")
+    if not torch.equal(pixels[:, 3:], following[:, :3]):
+        raise ConfigError(
+            "store: expected ('next', 'pixels') to begin with the second frame of 'pixels', received "
+            "other frames; stack two consecutive frames."
+        )
+    return pixels.cpu(), following.cpu()
 
 
 def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

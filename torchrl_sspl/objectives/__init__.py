@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torchrl_sspl.objectives.action_value import ActionValueLoss
 from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
+from torchrl_sspl.objectives.consistency import ConsistencyLoss
 from torchrl_sspl.objectives.deviation import PolicyDeviationLoss
 from torchrl_sspl.objectives.lipschitz import LipschitzLoss
 from torchrl_sspl.objectives.salad import SaLaDLoss
@@ -14,6 +15,7 @@ from torchrl_sspl.objectives.target import TargetLoss
 __all__ = [
     "ActionValueLoss",
     "PRESETS",
+    "ConsistencyLoss",
     "LatentBatch",
     "LatentLoss",
     "LipschitzLoss",

@@ -13,7 +13,7 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.objectives.base import LatentLoss
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
 
 
 def interpolate(table: Tensor, action: Tensor, *, action_scale: float | Tensor) -> Tensor:
@@ -46,6 +46,9 @@ def interpolate(table: Tensor, action: Tensor, *, action_scale: float | Tensor) 
     place = (action / action_scale + 1) / 2 * (k - 1)
     low = place.detach().floor().clamp(0, k - 2)
     share = (place - low).clamp(0.0, 1.0)
+    if dims == 1:
+        index = low.long()
+        return (1 - share) * table.gather(-1, index) + share * table.gather(-1, index + 1)
     powers = torch.tensor([k ** (dims - 1 - d) for d in range(dims)], device=action.device)
     value = torch.zeros_like(table[..., :1])
     for corner in product((0, 1), repeat=dims):
@@ -122,9 +125,13 @@ class ActionValueLoss(LatentLoss):
         """The loss on a batch of latents with the values of their actions; the batch is not changed."""
         batch = self._read(tensordict)
         table = self._counted(tensordict, self.tensor_keys.action_value, "action_value", batch)
+        return self._pack(self.terms(batch, table), tensordict)
+
+    def terms(self, batch: LatentBatch, table: Tensor) -> dict[str, Tensor]:
+        """The same for latents that have been read: what a loop of thousands of small steps calls."""
         action = self._run("actor_network", batch.latent)
         short = table.amax(-1, keepdim=True) - interpolate(table, action, action_scale=self.action_scale)
-        return self._pack({"loss_action_value": self._reduce(short / self.scale, batch, worst=True)}, tensordict)
+        return {"loss_action_value": self._reduce(short / self.scale, batch, worst=True)}
 
 
 __all__ = ["ActionValueLoss", "interpolate"]

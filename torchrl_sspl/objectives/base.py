@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule, TensorDictModuleBase
 from tensordict.utils import unravel_key
 from torch import Tensor, nn
+from torch.compiler import is_compiling
 from torchrl.objectives import LossModule
 
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
@@ -67,6 +70,52 @@ def next_key(key: NestedKey) -> NestedKey:
 def _batch_last(tensor: Tensor, batch: torch.Size) -> Tensor:
     """``(*batch,)`` or ``(*batch, 1)`` -> ``(*batch, 1)``."""
     return tensor.unsqueeze(-1) if tensor.shape == batch else tensor
+
+
+Leaf = tuple[dict[str, Any], str, Tensor]
+_LEAVES: WeakKeyDictionary[LossModule, dict[str, list[Leaf]]] = WeakKeyDictionary()
+
+
+def _leaves(loss: LossModule, name: str, network: nn.Module) -> list[Leaf]:
+    """Where a network keeps its parameters and buffers, and what the loss has for them: mostly the very same."""
+    known = _LEAVES.get(loss)
+    if known is None or "_cache_leaves" not in loss.__dict__:  # TorchRL forgets what begins so when a loss is cast
+        known, loss.__dict__["_cache_leaves"] = _LEAVES.setdefault(loss, {}), True
+        known.clear()
+    if name not in known:
+        known[name] = []
+        for key, value in getattr(loss, f"{name}_params").items(True, True):
+            *path, leaf = (key,) if isinstance(key, str) else key
+            owner = network.get_submodule(".".join(path))
+            known[name].append((owner._parameters if leaf in owner._parameters else owner._buffers, leaf, value))
+    return known[name]
+
+
+def _forget(loss: Any, *_: Any) -> None:
+    loss._erase_cache()
+
+
+def _called(network: Any, inputs: tuple[Tensor, ...], method: str | None, action: NestedKey) -> Tensor:
+    """What a network gives, of several things the action."""
+    if method is not None:
+        return getattr(network.module, method)(*inputs)
+    if type(network) is TensorDictModule:
+        return network.module(*inputs)
+    output = network(*inputs)
+    if isinstance(output, tuple):
+        output = output[network.out_keys.index(action) if action in network.out_keys else 0]
+    return output
+
+
+@lru_cache(maxsize=64)
+def _worst_rows(fraction: float, rows: int, dtype: torch.dtype) -> int:
+    """How many of all rows are the worst."""
+    return int((fraction * torch.tensor(rows, dtype=dtype)).ceil().clamp_min(1.0))
+
+
+def _same(held: Tensor | None, value: Tensor) -> bool:
+    """Whether a network holds a parameter, or a buffer of the same memory."""
+    return held is value or (held is not None and not value.requires_grad and held.data_ptr() == value.data_ptr())
 
 
 def _clean(value: Tensor, valid: Tensor | None) -> Tensor:
@@ -173,6 +222,7 @@ class LatentLoss(LossModule):
                 f"received {sorted(unknown)}"
             )
         super().__init__()
+        self.register_load_state_dict_post_hook(_forget)
         self._in_keys: list[NestedKey] | None = None
         self._networks_used: list[str] = []
         self._needs: set[str] = set()
@@ -314,6 +364,19 @@ class LatentLoss(LossModule):
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
         network = getattr(self, name)
+        if params != "target" and not is_compiling():
+            leaves = _leaves(self, name, network)
+            if all(_same(where.get(leaf), value) for where, leaf, value in leaves):  # nothing has to be put into it
+                if params == "online":
+                    return _called(network, inputs, method, self.tensor_keys.action)
+                learnt = [found for found in leaves if found[2].requires_grad]
+                try:
+                    for where, leaf, value in learnt:
+                        where[leaf] = value.data
+                    return _called(network, inputs, method, self.tensor_keys.action)
+                finally:
+                    for where, leaf, value in learnt:
+                        where[leaf] = value
         if params == "target":
             values = getattr(self, f"target_{name}_params")
         else:
@@ -324,15 +387,7 @@ class LatentLoss(LossModule):
         # body raised.
         swapped = values.to_module(network, preserve_module_state=False)
         try:
-            if method is not None:
-                return getattr(network.module, method)(*inputs)
-            if type(network) is TensorDictModule:
-                return network.module(*inputs)
-            output = network(*inputs)
-            if isinstance(output, tuple):
-                key = self.tensor_keys.action
-                output = output[network.out_keys.index(key) if key in network.out_keys else 0]
-            return output
+            return _called(network, inputs, method, self.tensor_keys.action)
         finally:
             swapped.to_module(network, preserve_module_state=False, return_swap=False)
 
@@ -463,12 +518,18 @@ class LatentLoss(LossModule):
         if worst and "worst_coeff" in self._active:
             # As a weight per row, so that every reduction and every mask sees the same term.
             flat = value.detach().flatten()
-            rows = torch.ones_like(flat).sum() if mask is None else mask.sum()
-            worst_rows = (self.worst_fraction * rows).ceil().clamp_min(1.0)
-            order = torch.arange(flat.numel(), device=flat.device)
-            rank = torch.empty_like(order).scatter(0, flat.argsort(descending=True), order)
-            among = (rank < worst_rows).reshape(value.shape)
-            value = value * torch.where(among, 1.0 + self.worst_coeff * rows / worst_rows, 1.0)
+            order = flat.argsort(descending=True)
+            if mask is None and not is_compiling():  # the number of rows is known
+                rows, worst_rows = flat.numel(), _worst_rows(self.worst_fraction, flat.numel(), flat.dtype)
+                weight = (1.0 + self.worst_coeff * rows / worst_rows).to(flat.dtype)
+                value = value * torch.ones_like(flat).index_fill_(0, order[:worst_rows], weight).reshape(value.shape)
+            else:
+                counted = torch.ones_like(flat).sum() if mask is None else mask.sum()
+                most = (self.worst_fraction * counted).ceil().clamp_min(1.0)
+                place = torch.arange(flat.numel(), device=flat.device)
+                rank = torch.empty_like(place).scatter(0, order, place)
+                among = (rank < most).reshape(value.shape)
+                value = value * torch.where(among, 1.0 + self.worst_coeff * counted / most, 1.0)
         weights = batch.weights
         if weights is not None:
             value = value * weights
@@ -480,10 +541,6 @@ class LatentLoss(LossModule):
             total = (weights if mask is None else torch.where(mask, weights, 0.0)).sum()
             return value.sum() / total.clamp_min(torch.finfo(value.dtype).tiny)
         return value.mean() if mask is None else value.sum() / mask.sum().clamp_min(1)
-
-    def _spread(self, statistic: Tensor, batch: LatentBatch) -> Tensor:
-        """Reduces a statistic of the batch as if every row had it."""
-        return self._reduce(statistic.expand(*batch.shape, 1), batch)
 
     def _pack(self, terms: dict[str, Tensor], tensordict: TensorDictBase) -> TensorDict:
         output = TensorDict({key: terms[key] for key in self.out_keys}, batch_size=[])

@@ -208,10 +208,10 @@ class SaLaDLoss(LatentLoss):
         deviation = (covariance.diagonal() + 1e-8).sqrt()
         if "variance_coeff" in self._active:
             variance = (self.variance_floor - deviation).clamp_min(0.0).mean()
-            terms["loss_variance"] = self.variance_coeff * self._spread(variance, batch)
+            terms["loss_variance"] = self.variance_coeff * self._reduce(variance.expand(*batch.shape, 1), batch)
         if "covariance_coeff" in self._active:
             mixed = (covariance.square().sum() - covariance.diagonal().square().sum()) / len(covariance)
-            terms["loss_covariance"] = self.covariance_coeff * self._spread(mixed, batch)
+            terms["loss_covariance"] = self.covariance_coeff * self._reduce(mixed.expand(*batch.shape, 1), batch)
         if "saturation_coeff" in self._active:
             # 1e-6: largest latent whose inverse tanh is finite in float32.
             depth = batch.latent.abs().clamp_max(1.0 - 1e-6).atanh()

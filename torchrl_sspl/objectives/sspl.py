@@ -162,7 +162,23 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
         ]
         if "policy_coeff" in self._active:
             parts.append((self.policy_coeff, self._deviation_terms(batch)))
-        terms = {}
+        return self._weighted(parts, tensordict)
+
+    def world_model(self, tensordict: TensorDictBase) -> TensorDict:
+        """The terms of the world model alone, as in a warm start; the others are zero and cost nothing.
+
+        Args:
+            tensordict: batch, as for :meth:`forward`.
+
+        Returns:
+            The keys of :meth:`forward`.
+
+        Source: paper, Algorithm 1 (warm start).
+        """
+        return self._weighted([(self.salad_coeff, self._salad_terms(self._read(tensordict)))], tensordict)
+
+    def _weighted(self, parts: list[tuple[Tensor, dict[str, Tensor]]], tensordict: TensorDictBase) -> TensorDict:
+        terms = {} if len(parts) > 1 else dict.fromkeys(self.out_keys, self.salad_coeff.new_zeros(()))
         for weight, part in parts:
             for key, value in part.items():
                 terms[key] = weight * value if key.startswith("loss_") else value

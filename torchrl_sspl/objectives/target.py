@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
 from torch import Tensor, nn
@@ -25,7 +26,7 @@ class TargetLoss(LatentLoss):
 
     with :math:`r = B(z) - t` inside the set, :math:`r = \max(0, \min(t, t_{\max}) - B(z))` outside (only the sign
     matters there), and the weight :math:`w(t) = e^{-|t| / s} + 0.1`, largest at the border. Targets come from
-    :mod:`torchrl_sspl.objectives.latent_viability`.
+    :mod:`torchrl_sspl.viability.cloud`.
 
     Args:
         barrier: latent -> barrier value ``(*batch, 1)``, at most zero means safe.
@@ -34,8 +35,8 @@ class TargetLoss(LatentLoss):
         outside_cap: :math:`t_{\max}`, value beyond which a target outside asks for no more.
         scale: s, in units of the barrier.
         policy_coeff: :math:`\kappa`.
-        safe_coeff: :math:`\xi_1`, on rows with region code 1.
-        unsafe_coeff: :math:`\xi_2`, on rows with region code 2.
+        safe_coeff: :math:`\xi_1`, on rows with region code 1; 0 leaves the term out.
+        unsafe_coeff: :math:`\xi_2`, on rows with region code 2; 0 leaves the term out.
         action_scale: :math:`u_{\max}`, largest action in physical units, a number or one per dimension.
         **shared: ``safety_margin`` :math:`\psi`, ``worst_coeff``, ``worst_fraction``, ``reduction``; see
             :class:`LatentLoss`.
@@ -50,7 +51,6 @@ class TargetLoss(LatentLoss):
     Source: none; the paper trains barrier and policy on the condition alone, from which no set grows.
 
     Example:
-        >>> import torch
         >>> from torchrl_sspl.modules import Policy
         >>> _ = torch.manual_seed(0)
         >>> loss = TargetLoss(nn.Linear(2, 1), Policy(2, 1))
@@ -133,13 +133,14 @@ class TargetLoss(LatentLoss):
         gap = (action - wanted) / self.action_scale
         weight = self._counted(tensordict, keys.action_weight, "action_weight", batch)
         follow = weight * gap.square().mean(-1, keepdim=True)
-        safe, unsafe = batch.region == SAFE, batch.region == UNSAFE
         terms = {
             "loss_target": self._reduce(fit, batch, worst=True),
             "loss_policy_target": self.policy_coeff * self._reduce(follow, batch),
-            "loss_safe": self.safe_coeff
-            * self._reduce(safe_hinge(barrier, self.safety_margin), batch, safe, worst=True),
-            "loss_unsafe": self.unsafe_coeff
-            * self._reduce(unsafe_hinge(barrier, self.safety_margin), batch, unsafe, worst=True),
         }
+        for name, hinge, code in (("safe", safe_hinge, SAFE), ("unsafe", unsafe_hinge, UNSAFE)):
+            if f"{name}_coeff" in self._active:
+                value = self._reduce(hinge(barrier, self.safety_margin), batch, batch.region == code, worst=True)
+                terms[f"loss_{name}"] = getattr(self, f"{name}_coeff") * value
+            else:
+                terms[f"loss_{name}"] = self._reduce(torch.zeros_like(barrier), batch)
         return self._pack(terms, tensordict)

@@ -1,0 +1,87 @@
+"""One registry of seeds: everything random in a run draws from the run's seed and a purpose with a name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from torchrl_sspl.errors import ConfigError
+
+#: What seeds are drawn for. A number is never given twice; a new purpose takes the next one.
+PURPOSES = {
+    "data": 0,  # recorded transitions and labelled observations
+    "weights": 1,  # initial weights
+    "training": 2,  # batches and noise of the optimisation
+    "collection": 3,  # environments of the collectors
+    "exploration": 4,  # noise on actions
+    "rounds": 5,  # data of the rounds of a synthesis
+    "checks": 6,  # held-out checks that select a round
+    "level": 7,  # episodes by which the zero level is chosen
+    "evaluation": 8,
+    "physics": 9,  # walks of a full-physics world
+    "certificate": 10,  # fresh episodes of a certificate
+    "certificate actions": 11,  # random actions among them
+    "report": 12,  # figures and films
+    "benchmark": 13,
+}
+_INDICES = 1 << 24
+_MASK = 0xFFFF_FFFF
+
+
+def spawn(seed: int, purpose: str, index: int = 0) -> int:
+    """Seed for one purpose of a run.
+
+    Two purposes or indices of one run never get the same seed: they are numbered, and the number is mixed into 32 bits by a
+    bijection. It has 32 bits because that is what ``torch.Generator`` keeps of a seed on the CPU. Different runs start from
+    different places, which :class:`numpy.random.SeedSequence` gives; between two of them a seed can be the same by a
+    chance of one in four thousand million, which :func:`used_before` finds.
+
+    Args:
+        seed: seed of the run, not negative.
+        purpose: one of :data:`PURPOSES`.
+        index: number among those of the purpose, below 2^24.
+
+    Returns:
+        Seed in [0, 2^32).
+
+    Raises:
+        ConfigError: if the purpose is not registered, or a number is out of range.
+
+    Source: none.
+
+    Example:
+        >>> len({spawn(0, purpose, k) for purpose in PURPOSES for k in range(100)}) == 100 * len(PURPOSES)
+        True
+    """
+    if purpose not in PURPOSES:
+        raise ConfigError(
+            f"expected one of the purposes {', '.join(PURPOSES)}, received {purpose!r}; register it there"
+        )
+    if not 0 <= index < _INDICES or seed < 0:
+        raise ConfigError(f"expected a seed >= 0 and an index in [0, {_INDICES}), received seed={seed}, index={index}")
+    start = int(np.random.SeedSequence(seed).generate_state(1)[0])
+    x = (start + PURPOSES[purpose] * _INDICES + index) & _MASK
+    # Bijections of 32 bits: multiplications by odd numbers, and exclusive ors with a shift of at least half.
+    x = ((x ^ (x >> 16)) * 0x85EBCA6B) & _MASK
+    x = ((x ^ (x >> 16)) * 0xC2B2AE35) & _MASK
+    return x ^ (x >> 16)
+
+
+def used_before(seed: int, history: Iterable[int]) -> bool:
+    """Whether a generator with this seed would repeat one of earlier seeds.
+
+    Args:
+        seed: the seed.
+        history: seeds that were used.
+
+    Returns:
+        Whether one of them agrees in the 32 bits that ``torch.Generator`` keeps on the CPU.
+
+    Source: none.
+
+    Example:
+        >>> used_before(1, [2**32 + 1]), used_before(1, [2])
+        (True, False)
+    """
+    return any((seed - other) & _MASK == 0 for other in history)
