@@ -1,4 +1,4 @@
-"""Training, evaluation and certification of agents; each name is loaded when it is first used."""
+"""Training on TorchRL's trainer: the joint loss on pictures, then phases on frozen latents; names load when first used."""
 
 from __future__ import annotations
 
@@ -6,51 +6,47 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what readers of the source, type checkers among them, need to know
-    from torchrl_sspl.trainers.certify import certify_on_episodes, verify_run
-    from torchrl_sspl.trainers.config import TrainingConfig, make_config
-    from torchrl_sspl.trainers.encoding import encode_transitions
-    from torchrl_sspl.trainers.episodes import evaluate_episodes
-    from torchrl_sspl.trainers.evaluation import evaluate, rollout
-    from torchrl_sspl.trainers.experiment import Experiment, run_experiment
-    from torchrl_sspl.trainers.latents import LatentTraining
-    from torchrl_sspl.trainers.paper import PaperTraining
-    from torchrl_sspl.trainers.pipeline import SafePolicyTraining
-    from torchrl_sspl.trainers.run import train
-    from torchrl_sspl.trainers.torchrl_trainer import SSPLTrainer
+    from torchrl_sspl.trainers.phases import Check, InnerLoop, Phase, Phases, Workspace
+    from torchrl_sspl.trainers.selection import CheckRound, PlaceLevel
+    from torchrl_sspl.trainers.source import Source, starts_of
+    from torchrl_sspl.trainers.synthesis import (
+        FineTune,
+        FitDynamics,
+        FitSets,
+        Gather,
+        SteerPolicy,
+        TeachPolicy,
+        synthesis_phases,
+    )
+    from torchrl_sspl.trainers.trainer import SSPLTrainer
 
 _NAMES = {
-    "SSPLTrainer": "torchrl_trainer",
-    "SafePolicyTraining": "pipeline",
-    "PaperTraining": "paper",
-    "TrainingConfig": "config",
-    "make_config": "config",
-    "train": "run",
-    "evaluate": "evaluation",
-    "rollout": "evaluation",
-    "certify_on_episodes": "certify",
-    "verify_run": "certify",
-    "LatentTraining": "latents",
-    "encode_transitions": "encoding",
-    "Experiment": "experiment",
-    "run_experiment": "experiment",
-    "evaluate_episodes": "episodes",
+    **dict.fromkeys(("Check", "InnerLoop", "Phase", "Phases", "Workspace"), "phases"),
+    **dict.fromkeys(("CheckRound", "PlaceLevel"), "selection"),
+    **dict.fromkeys(("Source", "starts_of"), "source"),
+    **dict.fromkeys(
+        ("FineTune", "FitDynamics", "FitSets", "Gather", "SteerPolicy", "TeachPolicy", "synthesis_phases"), "synthesis"
+    ),
+    "SSPLTrainer": "trainer",
 }
 __all__ = [
-    "Experiment",
-    "LatentTraining",
-    "PaperTraining",
+    "Check",
+    "CheckRound",
+    "FineTune",
+    "FitDynamics",
+    "FitSets",
+    "Gather",
+    "InnerLoop",
+    "Phase",
+    "Phases",
+    "PlaceLevel",
     "SSPLTrainer",
-    "SafePolicyTraining",
-    "TrainingConfig",
-    "certify_on_episodes",
-    "encode_transitions",
-    "evaluate",
-    "evaluate_episodes",
-    "make_config",
-    "rollout",
-    "run_experiment",
-    "train",
-    "verify_run",
+    "Source",
+    "SteerPolicy",
+    "TeachPolicy",
+    "Workspace",
+    "starts_of",
+    "synthesis_phases",
 ]
 
 

@@ -1,8 +1,13 @@
-"""Hooks of the TorchRL trainer: margins, seeds, fresh starts, evaluation, stop on a certificate, figures."""
+"""Hooks of the TorchRL trainer: margins, seeds, statistics of the encoder, fresh starts, clock, log, evaluation."""
 
 from __future__ import annotations
 
+import json
+import math
+import os
+import time
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -165,6 +170,127 @@ class SeedHook(TrainerHookBase):
         trainer.register_module(name, self)
 
 
+class FitEncoderHook(TrainerHookBase):
+    """Lets an encoder with a method ``fit`` take statistics of frames before the first optimiser step, and after a restart.
+
+    Args:
+        trainer: the trainer; its stepper counts the steps.
+        encoder: has ``fit(frames)``, frames uint8 ``(n, 3, H, W)``.
+        store: where frames come from.
+        frames: how many, of transitions spread over the whole store.
+
+    Source: none.
+
+    Example:
+        >>> FitEncoderHook(None, None, None).state_dict()
+        {}
+    """
+
+    def __init__(self, trainer: Any, encoder: Any, store: Any, *, frames: int = 2000) -> None:
+        self.trainer, self.encoder, self.store, self.frames = trainer, encoder, store, frames
+
+    def __call__(self) -> None:
+        """Fits where no step has been taken since the last start."""
+        if self.trainer.optimization_stepper.count == 0:
+            index = torch.linspace(0, len(self.store) - 1, min(self.frames, len(self.store))).long()
+            self.encoder.fit(self.store.get(index)["frames"][:, 1])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Nothing: the statistics are buffers of the encoder."""
+        return {}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Nothing to restore."""
+
+    def register(self, trainer: Trainer, name: str = "fit_encoder") -> None:
+        """Attaches the hook to ``pre_optim_steps``."""
+        trainer.register_op("pre_optim_steps", self)
+        trainer.register_module(name, self)
+
+
+class ClockHook(TrainerHookBase):
+    """Counts the seconds of a training over all of its interruptions.
+
+    Source: none.
+
+    Example:
+        >>> ClockHook().seconds < 1.0
+        True
+    """
+
+    def __init__(self) -> None:
+        self._before, self._began = 0.0, time.monotonic()
+
+    @property
+    def seconds(self) -> float:
+        """So far, in s."""
+        return self._before + time.monotonic() - self._began
+
+    def start(self) -> None:
+        """What went before in this process does not count."""
+        self._began = time.monotonic()
+
+    def state_dict(self) -> dict[str, float]:
+        """The seconds so far."""
+        return {"seconds": self.seconds}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self._before, self._began = float(state_dict["seconds"]), time.monotonic()
+
+    def register(self, trainer: Trainer, name: str = "clock") -> None:
+        """Registers the state alone."""
+        trainer.register_module(name, self)
+
+
+class LogHook(TrainerHookBase):
+    """Appends the mean terms of every batch's steps to ``log.jsonl``, and stops at a loss that is not finite.
+
+    What was logged after a checkpoint, also by the phases, is cut off when it is loaded: it will be logged again.
+
+    Args:
+        path: the file; ``None``: nothing is written.
+
+    Raises:
+        ConfigError: when called with a loss that is NaN or infinite.
+
+    Source: none.
+
+    Example:
+        >>> LogHook(None)(7, {"loss_safe": torch.zeros(())})
+    """
+
+    def __init__(self, path: str | Path | None) -> None:
+        self.path = None if path is None else Path(path)
+
+    def __call__(self, step: int, terms: Any) -> None:
+        """One line."""
+        row = {key: float(value) for key, value in terms.items() if value.numel() == 1}
+        bad = {key: value for key, value in row.items() if key.startswith("loss") and not math.isfinite(value)}
+        if bad:
+            raise ConfigError(
+                f"expected finite losses, received {bad} after step {step}; lower optim.lr, or resume from the last checkpoint "
+                "with another seed"
+            )
+        if self.path is not None:
+            with self.path.open("a") as file:
+                file.write(json.dumps({"phase": "joint", "round": 0, "step": step, **row}) + "\n")
+
+    def state_dict(self) -> dict[str, int]:
+        """How long the file is."""
+        return {"bytes": self.path.stat().st_size if self.path is not None and self.path.is_file() else 0}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Cuts the file to that length."""
+        if self.path is not None and self.state_dict()["bytes"] > int(state_dict["bytes"]):
+            os.truncate(self.path, int(state_dict["bytes"]))
+
+    def register(self, trainer: Trainer, name: str = "log") -> None:
+        """Attaches the hook to ``post_optim_complete_log``."""
+        trainer.register_op("post_optim_complete_log", self)
+        trainer.register_module(name, self)
+
+
 class RestartHook(TrainerHookBase):
     """Begins again with fresh weights where the warm start does not tell S from U.
 
@@ -237,10 +363,9 @@ class EveryHook(TrainerHookBase):
         call: ``trainer -> mapping of floats``. With the entry ``"stop"`` (a text, or ``None``) it can end the
             training: the certificate holds, the figures are reached.
         every: collected batches between two calls.
-        names: the keys that ``call`` returns, ``"stop"`` apart; with them a result with others is an error.
 
     Raises:
-        ConfigError: if ``every`` is not positive, or the keys are others than ``names``.
+        ConfigError: if ``every`` is not positive.
 
     Source: paper, Algorithm 1 (stop rule); deviation: the printed rule, a total loss of zero, is never met.
 
@@ -249,17 +374,10 @@ class EveryHook(TrainerHookBase):
         {'count': 0}
     """
 
-    def __init__(
-        self,
-        trainer: Any,
-        call: Callable[[Any], Mapping[str, Any]],
-        *,
-        every: int = 1,
-        names: tuple[str, ...] | None = None,
-    ) -> None:
+    def __init__(self, trainer: Any, call: Callable[[Any], Mapping[str, Any]], *, every: int = 1) -> None:
         if every < 1:
             raise ConfigError(f"expected every >= 1 batches, received {every}")
-        self.trainer, self.call, self.every, self.names, self.count = trainer, call, every, names, 0
+        self.trainer, self.call, self.every, self.count = trainer, call, every, 0
 
     def __call__(self, batch: TensorDictBase | None) -> dict[str, Any] | None:
         """Counts, and runs when it is time."""
@@ -270,8 +388,6 @@ class EveryHook(TrainerHookBase):
         with torch.no_grad(), torch.random.fork_rng():
             result = dict(self.call(self.trainer))
         reason = result.pop("stop", None)
-        if self.names is not None and set(result) != set(self.names):
-            raise ConfigError(f"expected the keys {sorted(self.names)}, received {sorted(result)}")
         if reason is not None:
             self.trainer.request_stop(str(reason))
         return {**result, "log_pbar": False} if result else None

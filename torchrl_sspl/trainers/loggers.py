@@ -6,6 +6,7 @@ import io
 import os
 import socket
 import sys
+import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -171,7 +172,7 @@ def _stored_key() -> str | None:
 
 
 def log_scalars(logger: Any, values: Mapping[str, Any], step: int) -> None:
-    """Give a logger the metrics of a step, in one row where it has rows.
+    """Give a logger the metrics of a step, in one row where it has rows; its failure is a warning.
 
     Args:
         logger: TorchRL logger, or ``None``.
@@ -192,12 +193,14 @@ def log_scalars(logger: Any, values: Mapping[str, Any], step: int) -> None:
     if logger is None:
         return
     for position, (name, value) in enumerate(values.items()):
-        options = {"commit": position == len(values) - 1} if type(logger).__name__ == "WandbLogger" else {}
-        logger.log_scalar(name, float(value), step=step, **options)
+        # A run of wandb has rows, which the last value of a step ends.
+        options = {} if _wandb_run(logger) is None else {"commit": position == len(values) - 1}
+        with _costs_a_warning(logger, name):
+            logger.log_scalar(name, float(value), step=step, **options)
 
 
 def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
-    """Give a matplotlib figure to a TorchRL logger, as far as that kind of logger can take one.
+    """Give a matplotlib figure to a TorchRL logger, as far as that kind of logger can take one; its failure is a warning.
 
     Args:
         logger: a wandb, tensorboard or csv logger; the latter keeps a png file beside its scalars.
@@ -214,22 +217,27 @@ def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
         >>> log_figure(None, "latent", None, 0) is None
         True
     """
-    experiment: Any = getattr(logger, "experiment", None)
-    if hasattr(experiment, "add_figure"):  # tensorboard
-        experiment.add_figure(name, figure, global_step=step, close=False)
-    elif type(logger).__name__ == "WandbLogger":
-        import wandb
+    with _costs_a_warning(logger, f"the figure '{name}'"):
+        run, experiment = _wandb_run(logger), _experiment(logger)
+        if run is not None:
+            import wandb
+            from PIL import Image
 
-        experiment.log({name: wandb.Image(figure)})
-    elif getattr(logger, "log_dir", None) is not None:
-        path = _folder(logger, "figures") / f"{name}_{step}.png"
-        figure.savefig(path)
-        return path
+            png = io.BytesIO()
+            figure.savefig(png, format="png")  # wandb's own conversion needs pyplot
+            with Image.open(png) as picture:
+                run.log({name: wandb.Image(picture)})
+        elif hasattr(experiment, "add_figure"):  # tensorboard
+            experiment.add_figure(name, figure, global_step=step, close=False)
+        elif getattr(logger, "log_dir", None) is not None:
+            path = _folder(logger, "figures") / f"{name}_{step}.png"
+            figure.savefig(path)
+            return path
     return None
 
 
 def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 10) -> Path | None:
-    """Give a film to a TorchRL logger; none of them needs a package beyond Pillow for it.
+    """Give a film to a TorchRL logger, with no package beyond Pillow; its failure is a warning.
 
     Args:
         logger: a wandb, tensorboard or csv logger; the latter keeps a gif file beside its scalars.
@@ -244,7 +252,6 @@ def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 1
     Raises:
         ShapeError: if there is no frame, or the shape does not fit.
         DTypeError: if the frames are not uint8.
-        MissingDependencyError: if Pillow is not installed.
 
     Source: none.
 
@@ -259,26 +266,27 @@ def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 1
         raise ShapeError(f"frames: expected shape (T, 3, H, W) with T >= 1, received {tuple(frames.shape)}.")
     if logger is None:
         return None
-    film = encode_gif(frames, fps)
-    experiment: Any = getattr(logger, "experiment", None)
-    if type(logger).__name__ == "WandbLogger":
-        import wandb
+    with _costs_a_warning(logger, f"the film '{name}'"):
+        film = encode_gif(frames, fps)
+        run, experiment = _wandb_run(logger), _experiment(logger)
+        if run is not None:
+            import wandb
 
-        path = Path(experiment.dir) / f"{name}_{step}.gif"
-        path.write_bytes(film)
-        experiment.log({name: wandb.Video(str(path), format="gif")})
-        return path
-    if hasattr(experiment, "add_figure"):
-        from tensorboard.compat.proto.summary_pb2 import Summary
+            path = Path(run.dir) / f"{name}_{step}.gif"
+            path.write_bytes(film)
+            run.log({name: wandb.Video(str(path), format="gif")})
+            return path
+        if hasattr(experiment, "add_figure"):  # tensorboard
+            from tensorboard.compat.proto.summary_pb2 import Summary
 
-        height, width = frames.shape[2:]
-        image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=film)
-        experiment._get_file_writer().add_summary(Summary(value=[Summary.Value(tag=name, image=image)]), step)
-        return None
-    if getattr(logger, "log_dir", None) is not None:
-        path = _folder(logger, "videos") / f"{name}_{step}.gif"
-        path.write_bytes(film)
-        return path
+            height, width = frames.shape[2:]
+            image = Summary.Image(height=height, width=width, colorspace=3, encoded_image_string=film)
+            value = Summary.Value(tag=name, image=image)
+            experiment._get_file_writer().add_summary(Summary(value=[value]), step)
+        elif getattr(logger, "log_dir", None) is not None:
+            path = _folder(logger, "videos") / f"{name}_{step}.gif"
+            path.write_bytes(film)
+            return path
     return None
 
 
@@ -308,14 +316,36 @@ def close_logger(logger: Any) -> None:
 
     Source: none.
     """
-    experiment: Any = getattr(logger, "experiment", None)
-    if type(logger).__name__ == "WandbLogger":
-        experiment.finish()
-    elif hasattr(experiment, "close"):
-        experiment.close()
-    else:
-        for file in getattr(experiment, "files", {}).values():
-            file.close()
+    with _costs_a_warning(logger, "what it still holds"):
+        run, experiment = _wandb_run(logger), _experiment(logger)
+        if run is not None:
+            run.finish()
+        elif hasattr(experiment, "close"):
+            experiment.close()
+        else:
+            for file in getattr(experiment, "files", {}).values():
+                file.close()
+
+
+def _experiment(logger: Any) -> Any:
+    """What a logger writes to."""
+    return getattr(logger, "experiment", None)
+
+
+def _wandb_run(logger: Any) -> Any | None:
+    """The same, if it has what a run of wandb has."""
+    experiment = _experiment(logger)
+    return experiment if hasattr(experiment, "finish") and hasattr(experiment, "log") else None
+
+
+@contextmanager
+def _costs_a_warning(logger: Any, what: str) -> Iterator[None]:
+    """A logger that fails does not end a run: its numbers are in the run's own files too."""
+    try:
+        yield
+    except Exception as error:
+        told = f"{type(logger).__name__} did not take {what}: {type(error).__name__}: {error}"
+        warnings.warn(told, stacklevel=4)
 
 
 def _folder(logger: Any, kind: str) -> Path:

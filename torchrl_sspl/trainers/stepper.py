@@ -14,20 +14,6 @@ from torchrl.trainers import OptimizationStepper, Trainer
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.objectives import LipschitzLoss
 
-#: Terms of the world model, which alone are trained during the warm start.
-WARM_TERMS = frozenset(
-    f"loss_{name}"
-    for name in (
-        "safe",
-        "unsafe",
-        "consistency",
-        "inverse_dynamics",
-        "variance",
-        "covariance",
-        "saturation",
-    )
-)
-
 
 @contextmanager
 def _without_worst(loss: nn.Module) -> Iterator[None]:
@@ -50,7 +36,7 @@ class SSPLStepper(OptimizationStepper):
 
     Args:
         optimizer: optimiser of the total loss.
-        warm_start_steps: steps on the world model alone.
+        warm_start_steps: steps on the world model alone; -1: all of them.
         warm_start_error: the warm start goes on until S and U are told apart: until the running mean of ``safe_error`` +
             ``unsafe_error`` (over about fifty steps) is at most this. Until then the worst rows do not count extra.
             ``None`` goes by the number of steps alone.
@@ -91,8 +77,8 @@ class SSPLStepper(OptimizationStepper):
                 "expected lipschitz_loss and lipschitz_optimizer together, received one of them; give both for an "
                 "LMIBarrier, none for a sandwich barrier"
             )
-        if warm_start_steps < 0:
-            raise ConfigError(f"expected warm_start_steps >= 0, received {warm_start_steps}")
+        if warm_start_steps < -1:
+            raise ConfigError(f"expected warm_start_steps >= 0, or -1 for all steps, received {warm_start_steps}")
         if warm_start_error is not None and not warm_start_error > 0:
             raise ConfigError(f"expected warm_start_error > 0 or None, received {warm_start_error}")
         self.optimizer, self.lipschitz_optimizer = optimizer, lipschitz_optimizer
@@ -124,14 +110,13 @@ class SSPLStepper(OptimizationStepper):
             Detached scalars.
         """
         blind = self.blind
-        warm = blind or self.count < self.warm_start_steps
+        warm = blind or self.count < self.warm_start_steps or self.warm_start_steps < 0
         self.count += 1
         device = self.optimizer.param_groups[0]["params"][0].device.type
         eased = _without_worst(trainer.loss_module) if blind else nullcontext()
         with eased, torch.autocast(device, dtype=self.autocast, enabled=self.autocast is not None):
-            terms = trainer.compute_loss(sub_batch)
-            counted = [v for k, v in terms.items() if k.startswith("loss_") and (not warm or k in WARM_TERMS)]
-            total: Tensor = sum(counted)  # type: ignore[assignment]
+            terms = trainer.compute_loss(sub_batch, method="world_model" if warm else None)
+            total: Tensor = sum(v for k, v in terms.items() if k.startswith("loss_"))  # type: ignore[assignment]
         self.optimizer.zero_grad()
         total.backward()
         norm = self._clip(trainer)

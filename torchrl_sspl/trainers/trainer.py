@@ -1,8 +1,9 @@
-"""TorchRL's trainer for the total loss: stepper, margins, seeds, checks and checkpoints in place."""
+"""TorchRL's trainer for the whole method: the joint training on pictures, then the phases on frozen latents."""
 
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -15,15 +16,18 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import SoftUpdate, TargetNetUpdater
 from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer, UpdateWeights
+from tqdm import tqdm
 
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules import make_rollout_policy
 from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
-from torchrl_sspl.trainers.hooks import EveryHook, MarginHook, SeedHook
+from torchrl_sspl.trainers.hooks import ClockHook, EveryHook, FitEncoderHook, LogHook, MarginHook, SeedHook
 from torchrl_sspl.trainers.loggers import log_figure
+from torchrl_sspl.trainers.phases import LOG_FILE, Phases
 from torchrl_sspl.trainers.stepper import SSPLStepper
 
 Call = Callable[["SSPLTrainer"], Mapping[str, Any]]
+_PICTURES = ("replay_buffer", "trainer_module.replay_buffer")  # components that hold pictures
 
 
 class _RNGState(GlobalRNGState):
@@ -39,10 +43,11 @@ class SSPLTrainer(Trainer):
 
     Per collected batch: store it; re-estimate the margins; ``optim_steps_per_batch`` steps on the
     total loss (and on :math:`L_M` where the barrier needs it), each followed by the target-network
-    update; hand the new weights to the collector; evaluate, draw, check whether to stop; save. With
-    ``checkpoint_dir`` a run that was killed at any moment continues from its last complete checkpoint
-    through :meth:`resume`, and on one CPU process ends with the very weights of a run that was never
-    killed, if the collector resets at each iteration (``reset_at_each_iter=True``).
+    update; hand the new weights to the collector; evaluate, draw, check whether to stop; save. When all
+    transitions are collected, the ``phases`` follow. With ``checkpoint_dir`` a run that was killed at any
+    moment continues from its last complete checkpoint through :meth:`resume`, and on one CPU process ends
+    with the very weights of a run that was never killed, if the collector resets at each iteration
+    (``reset_at_each_iter=True``).
 
     Args:
         collector: TorchRL collector.
@@ -52,7 +57,7 @@ class SSPLTrainer(Trainer):
         replay_buffer: where transitions go and batches come from, such as ``TransitionStore.replay_buffer``.
         optim_steps_per_batch: steps per collected batch.
         frame_skip: environment steps per transition.
-        warm_start_steps: steps on the world model alone, before everything else counts.
+        warm_start_steps: steps on the world model alone, before everything else counts; -1: all of them.
         warm_start_error: share of S and U on the wrong side down to which the warm start goes on; ``None`` goes by the
             steps alone.
         target_net_updater: updater of :math:`\theta^-`; needed if and only if the loss has delayed networks.
@@ -66,11 +71,16 @@ class SSPLTrainer(Trainer):
         draw: ``trainer -> mapping of names to figures``, given to the logger.
         draw_every: collected batches between drawings.
         checkpoint_dir: folder of the checkpoints; ``None`` for none.
-        checkpoint_every: collected transitions between checkpoints; 0 saves after every batch.
+        checkpoint_seconds: seconds between checkpoints, in the joint training and in the phases; 0 saves after every
+            batch, and after every step of a phase.
         keep_checkpoints: number of checkpoints that are kept.
         autocast: dtype of mixed precision.
+        phases: what follows when all transitions are collected; see
+            :class:`~torchrl_sspl.trainers.phases.Phases`.
+        out_dir: where ``log.jsonl`` is written; ``None``: nowhere.
+        progress_bar: show one bar over the joint training and the phases.
         **trainer_options: further arguments of ``torchrl.trainers.Trainer``, such as ``logger``,
-            ``clip_norm``, ``progress_bar``, ``log_interval``, ``seed``.
+            ``clip_norm``, ``log_interval``, ``seed``.
 
     Raises:
         ConfigError: if the loss is no ``SSPLLoss``, or arguments do not go together.
@@ -122,29 +132,15 @@ class SSPLTrainer(Trainer):
         draw: Call | None = None,
         draw_every: int = 1,
         checkpoint_dir: str | os.PathLike[str] | None = None,
-        checkpoint_every: int = 0,
+        checkpoint_seconds: float = 0.0,
         keep_checkpoints: int = 2,
         autocast: torch.dtype | None = None,
+        phases: Phases | None = None,
+        out_dir: str | os.PathLike[str] | None = None,
+        progress_bar: bool = True,
         **trainer_options: Any,
     ) -> None:
-        if not isinstance(loss_module, SSPLLoss):
-            raise ConfigError(
-                f"expected loss_module to be an SSPLLoss, received {type(loss_module).__name__}"
-            )
-        if trainer_options.get("learner_backend", "local") != "local":
-            raise ConfigError(
-                f"expected learner_backend='local', received {trainer_options['learner_backend']!r}; TorchRL's remote learner "
-                "sends collectors the weights of actor_network alone, and a policy from pixels needs those of the encoder "
-                "too; put the collectors on Ray instead"
-            )
-        delayed = any(name.startswith("target_") for name, _ in loss_module.named_children())
-        if target_net_updater is not None and not delayed:
-            raise ConfigError(
-                "expected no target_net_updater for a loss without delayed networks, received "
-                f"{type(target_net_updater).__name__}; choose consistency='target' or successor='target', or leave it out"
-            )
-        if delayed and target_net_updater is None:
-            target_net_updater = SoftUpdate(loss_module, tau=0.01)
+        target_net_updater = self._checked(loss_module, target_net_updater, trainer_options)
         stepper = SSPLStepper(
             optimizer,
             warm_start_steps=warm_start_steps,
@@ -158,9 +154,8 @@ class SSPLTrainer(Trainer):
                 # In name order the generator comes after what might draw from it, the collector.
                 "checkpoint": Checkpoint(rng=_RNGState()),
                 "checkpoint_rotation": CheckpointRotation(checkpoint_dir, keep_last=keep_checkpoints),
-                # TorchRL saves when more than this number was collected.
-                "save_trainer_interval": checkpoint_every - 1,
             }
+        self.checkpoint_seconds, self._saved_at = checkpoint_seconds, time.monotonic()
         super().__init__(
             collector=collector,
             total_frames=total_frames,
@@ -170,35 +165,127 @@ class SSPLTrainer(Trainer):
             optimization_stepper=stepper,
             replay_buffer=replay_buffer,
             target_net_updater=target_net_updater,
+            progress_bar=False,
             **trainer_options,
         )
-        device = loss_module.safety_margin.device
-        replay = ReplayBufferTrainer(
-            replay_buffer, flatten_tensordicts=True, device=None if device.type == "cpu" else device
-        )
-        self.register_op("batch_process", replay.extend)
-        self.register_op("process_optim_batch", replay.sample)
-        self.register_module("replay_buffer", replay)
-        if target_net_updater is not None:
-            self.register_op("post_optim", TargetNetUpdaterHook(target_net_updater))
-        if rollout_policy is None and loss_module.encoder is not None:
-            rollout_policy = make_rollout_policy(loss_module.encoder, loss_module.actor_network)
-        if rollout_policy is not None:
-            weights = partial(TensorDict.from_module, rollout_policy)
-            self.register_op("post_steps", UpdateWeights(collector, 1, policy_weights_getter=weights))
-        if margins is not None:
-            margins.register(self)
-        SeedHook(collector).register(self)
+        self.phases, self.clock, self.show_progress, self.resumed = phases, ClockHook(), progress_bar, False
+        self._register(replay_buffer, margins, rollout_policy, out_dir)
         if evaluate is not None:
             EveryHook(self, evaluate, every=evaluate_every).register(self, "evaluate")
         if draw is not None:
             EveryHook(self, partial(self._draw, draw), every=draw_every).register(self, "draw")
+        if phases is not None:  # last: what they begin with is complete
+            phases.register(self)
+
+    @staticmethod
+    def _checked(
+        loss: SSPLLoss, updater: TargetNetUpdater | None, options: dict[str, Any]
+    ) -> TargetNetUpdater | None:
+        """The target-network updater, after a look at what does not go together."""
+        if not isinstance(loss, SSPLLoss):
+            raise ConfigError(f"expected loss_module to be an SSPLLoss, received {type(loss).__name__}")
+        if options.get("learner_backend", "local") != "local":
+            raise ConfigError(
+                f"expected learner_backend='local', received {options['learner_backend']!r}; TorchRL's remote learner "
+                "sends collectors the weights of actor_network alone, and a policy from pixels needs those of the encoder "
+                "too; put the collectors on Ray instead"
+            )
+        delayed = any(name.startswith("target_") for name, _ in loss.named_children())
+        if updater is not None and not delayed:
+            raise ConfigError(
+                "expected no target_net_updater for a loss without delayed networks, received "
+                f"{type(updater).__name__}; choose consistency='target' or successor='target', or leave it out"
+            )
+        return SoftUpdate(loss, tau=0.01) if delayed and updater is None else updater
+
+    def _register(
+        self,
+        replay_buffer: ReplayBuffer,
+        margins: MarginHook | None,
+        rollout_policy: TensorDictModuleBase | None,
+        out_dir: str | os.PathLike[str] | None,
+    ) -> None:
+        """The hooks of the joint training, in the order in which they act."""
+        loss, device = self.loss_module, self.loss_module.safety_margin.device
+        replay = ReplayBufferTrainer(replay_buffer, flatten_tensordicts=True, device=None if device.type == "cpu" else device)
+        self.register_op("batch_process", replay.extend)
+        self.register_op("process_optim_batch", replay.sample)
+        self.register_module("replay_buffer", replay)
+        if self.target_net_updater is not None:
+            self.register_op("post_optim", TargetNetUpdaterHook(self.target_net_updater))
+        if rollout_policy is None and loss.encoder is not None:
+            rollout_policy = make_rollout_policy(loss.encoder, loss.actor_network)
+        if rollout_policy is not None:
+            weights = partial(TensorDict.from_module, rollout_policy)
+            self.register_op("post_steps", UpdateWeights(self.collector, 1, policy_weights_getter=weights))
+        encoder = getattr(loss.encoder, "module", None)
+        store = getattr(replay_buffer, "storage", None)
+        if callable(getattr(encoder, "fit", None)) and hasattr(store, "n_frames"):
+            FitEncoderHook(self, encoder, store).register(self)
+        if margins is not None:
+            margins.register(self)
+        SeedHook(self.collector).register(self)
+        self.clock.register(self)
+        LogHook(None if out_dir is None else Path(out_dir) / LOG_FILE).register(self)
+        self.register_op("post_optim", self._tick)
+
+    # ------------------------------------------------------------------ running
+
+    def train(self) -> None:
+        """Train, or continue to train, to the end: the joint training, then the phases."""
+        self.clock.start()
+        self._bar = tqdm(
+            total=self._joint_steps() + (0 if self.phases is None else self.phases.steps), unit="step",
+            initial=self._optim_count + (0 if self.phases is None else self.phases.steps_done),
+            disable=not self.show_progress, desc="joint", postfix="resumed" if self.resumed else None,
+        )  # fmt: skip
+        if self.phases is not None:
+            self.phases.bar = self._bar
+        try:
+            if self.collected_frames < self.total_frames:
+                super().train()
+            else:
+                if self.phases is not None and not self.phases.finished:
+                    self.phases.run()
+                    self.save_trainer(force_save=True)
+                self.collector.shutdown()
+        finally:
+            self._bar.close()
+
+    def _joint_steps(self) -> int:
+        """Optimiser steps of the joint training, in all."""
+        frames = max(1, int(getattr(self.collector, "requested_frames_per_batch", 0) or self.collector.frames_per_batch))
+        before = -(-max(0, int(self.collector.init_random_frames or 0)) // frames)
+        return max(1, -(-self.total_frames // frames) - max(before, 1) + 1) * int(self.optim_steps_per_batch or 1)
+
+    def _tick(self) -> None:
+        self._bar.update()
 
     @staticmethod
     def _draw(draw: Call, trainer: SSPLTrainer) -> dict[str, Any]:
         for name, figure in draw(trainer).items():
             log_figure(trainer.logger, name, figure, trainer.collected_frames)
         return {}
+
+    def save_trainer(self, force_save: bool = False) -> None:
+        """Save when ``checkpoint_seconds`` have passed since the last checkpoint, or when it is asked for."""
+        if not self._has_checkpoint_destination():
+            return
+        if force_save or time.monotonic() - self._saved_at >= self.checkpoint_seconds:
+            self._save_trainer()
+            self._saved_at = time.monotonic()
+
+    def _save_trainer(self) -> None:
+        """Write a checkpoint; inside the phases without the pictures, which are not needed any more."""
+        if self.checkpoint_rotation is None:
+            return super()._save_trainer()
+        checkpoint = self._sync_checkpoint_components()
+        inside = self.phases is not None and self.phases.begun
+        names = [name for name in checkpoint.components if not (inside and name in _PICTURES)]
+        step = self.collected_frames + (self.phases.steps_done + self.phases.done if inside else 0)  # type: ignore[union-attr]
+        metadata = self._checkpoint_manifest_metadata()
+        self.checkpoint_rotation.save(checkpoint, step=step, components=names, metadata=metadata)
+        return None
 
     def resume(self) -> bool:
         """Continues from the newest complete checkpoint, if there is one.
@@ -219,10 +306,15 @@ class SSPLTrainer(Trainer):
         if latest is None:
             return False
         try:
-            self.load_from_file(latest)
+            checkpoint = self._sync_checkpoint_components()
+            there = set(Checkpoint.manifest(latest)["components"])
+            names = [name for name in checkpoint.components if name in there or name not in _PICTURES]
+            checkpoint.load(latest, components=names, map_location="cpu")
+            self.collector.update_policy_weights_()
         except Exception as error:
             raise CheckpointError(
                 f"expected a checkpoint of this trainer in '{latest}', received {type(error).__name__}: "
                 f"{str(error)[:200]}; remove it to go back to the one before, or build the same networks"
             ) from error
+        self.resumed = True
         return True

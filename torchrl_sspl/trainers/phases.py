@@ -1,0 +1,467 @@
+r"""Phases that follow the joint training, as one hook of a TorchRL trainer, each resumable at any step.
+
+A phase is a small object with a name, a size and ``run(work)``. What the phases share, above all the frozen encoder's
+latents and the networks trained on them, is the :class:`Workspace`; its :class:`InnerLoop` is the one optimiser loop on
+frozen tensors. :class:`Phases` runs them in order, in any trainer.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchrl.trainers import Trainer, TrainerHookBase
+from tqdm import tqdm
+
+from torchrl_sspl.configs.schema import SynthesisConfig
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.trainers.loggers import METRICS, log_scalars
+from torchrl_sspl.trainers.source import Source
+
+LOG_FILE = "log.jsonl"
+
+
+class InnerLoop:
+    """The optimiser loop on frozen tensors that all phases share: Adam, one cycle of the learning rate, exact resume.
+
+    Args:
+        seed: seed of the generator that batches are drawn with.
+
+    Source: none.
+
+    Example:
+        >>> weight = nn.Linear(1, 1)
+        >>> loop = InnerLoop(seed=0)
+        >>> loop(100, {weight: 0.1}, lambda: {"loss_square": weight(torch.ones(1)).square().sum()})
+        >>> bool(weight(torch.ones(1)).square() < 0.1)
+        True
+    """
+
+    def __init__(self, seed: int) -> None:
+        self.generator = torch.Generator().manual_seed(seed)
+        self.step = 0
+        self.tick: Callable[[], None] = lambda: None  # after every step
+        self.log: Callable[[dict[str, Any]], None] = lambda row: None
+        self._live: tuple[Any, Any] | None = None
+        self._saved: dict[str, Any] | None = None
+
+    def pick(self, n: int, size: int) -> Tensor:
+        """``(size,)`` rows of n, drawn uniformly."""
+        return torch.randint(n, (size,), generator=self.generator)
+
+    def __call__(self, steps: int, networks: dict[nn.Module, float], loss: Callable[[], Any]) -> None:
+        """Take the steps that are missing.
+
+        Args:
+            steps: of this phase, in all.
+            networks: what is trained, with the peak learning rate of each.
+            loss: draws a batch, returns terms (a TensorDict or a dictionary); those named ``loss*`` are added up.
+
+        Raises:
+            ConfigError: a loss is not finite.
+        """
+        adam = torch.optim.Adam([{"params": list(m.parameters()), "lr": lr} for m, lr in networks.items()])
+        # Of ten steps the rise would be one minus one: OneCycleLR divides by it.
+        total = 11 if steps == 10 else max(steps, 2)
+        cycle = torch.optim.lr_scheduler.OneCycleLR(adam, list(networks.values()), total_steps=total, pct_start=0.1)
+        parameters = [p for m in networks for p in m.parameters()]
+        if self._saved is None:
+            torch.manual_seed(int(torch.randint(2**31, (1,), generator=self.generator)))
+        else:
+            adam.load_state_dict(self._saved["optimiser"])
+            cycle.load_state_dict(self._saved["schedule"])
+            torch.set_rng_state(self._saved["global_rng"])
+            self._saved = None
+        self._live = adam, cycle
+        while self.step < steps:
+            terms = loss()
+            objective = sum(value for key, value in terms.items() if key.startswith("loss"))
+            for p in parameters:
+                p.grad = None
+            objective.backward()  # type: ignore[union-attr]
+            adam.step()
+            cycle.step()
+            self.step += 1
+            if self.step % 100 == 0 or self.step == steps:
+                row = {k: float(v.detach()) for k, v in terms.items()}
+                if not all(map(math.isfinite, row.values())):
+                    raise ConfigError(
+                        f"expected finite losses, received {row} in step {self.step}; lower the learning rate, or resume "
+                        "from the last checkpoint with another seed"
+                    )
+                self.log({"step": self.step, **row})
+            self.tick()
+        self._live = None
+
+    def restart(self) -> None:
+        """For the next phase."""
+        self.step, self._live, self._saved = 0, None, None
+
+    def state_dict(self) -> dict[str, Any]:
+        """Step, generators, and the optimiser's state inside a phase."""
+        state: dict[str, Any] = {"step": self.step, "generator": self.generator.get_state(), "inside": self._live is not None}
+        if self._live is not None:
+            adam, cycle = self._live
+            state |= {"optimiser": adam.state_dict(), "schedule": _plain(cycle), "global_rng": torch.get_rng_state()}
+        return state
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self.step = int(state["step"])
+        self.generator.set_state(state["generator"])
+        self._live = None
+        self._saved = dict(state) if state["inside"] else None
+
+
+@dataclass
+class Check:
+    """Held-out checks of one round.
+
+    Attributes:
+        round: number of the round.
+        level: shift of the barrier with which the checks were made; {B <= level} became {B <= 0}.
+        unsafe_inside: held-out observations of U inside the set.
+        safe_outside: held-out observations of S outside the set.
+        left: held-out episodes that left the set.
+        touched: held-out episodes that touched U.
+        returned: share of held-out episodes from U that ended inside the set.
+        size: share of the held-out unlabelled observations inside the set.
+        passed: whether the set may be returned.
+        reason: why not.
+    """
+
+    round: int
+    level: float
+    unsafe_inside: int
+    safe_outside: int
+    left: int
+    touched: int
+    returned: float
+    size: float
+    passed: bool
+    reason: str
+
+
+class Workspace:
+    r"""What the phases share: a frozen encoder, its latents, and the networks that are trained on them.
+
+    The networks are copies on the CPU; when the last phase is done, their weights go back into those that were given.
+
+    Args:
+        encoder: pixels -> latent; frozen here.
+        dynamics, barrier, policy: on latents; TensorDictModules are unwrapped.
+        config: settings of the phases.
+        source: where transitions come from; ``None`` where all latents are given by the first phase.
+        seed: seed of everything that is drawn.
+        out_dir: where ``log.jsonl`` is written; ``None``: nowhere.
+        description: whatever should travel with the agent.
+
+    Source: paper Algorithm 1; deviation: two time scales, the encoder stands still while the rest is trained.
+    """
+
+    def __init__(
+        self,
+        encoder: nn.Module,
+        dynamics: nn.Module,
+        barrier: nn.Module,
+        policy: nn.Module,
+        *,
+        config: SynthesisConfig | None = None,
+        source: Source | None = None,
+        seed: int = 0,
+        out_dir: str | Path | None = None,
+        description: dict[str, Any] | None = None,
+    ) -> None:
+        named = {"dynamics": dynamics, "barrier": barrier, "policy": policy}
+        self.originals = {k: getattr(net, "module", net) for k, net in named.items()}
+        self.encoder = getattr(encoder, "module", encoder)
+        self.config, self.source, self.seed = config or SynthesisConfig(), source, seed
+        self.out_dir = None if out_dir is None else Path(out_dir)
+        self.description = dict(description or {})
+        self.loop = InnerLoop(seed)
+        self.loop.log = self.log
+        self.logger: Any = None  # of TorchRL
+        self.logged_step = 0
+        self.where: dict[str, Any] = {"phase": "", "round": 0}
+        self.latents: dict[str, Tensor] = {}
+        self.counterexamples = torch.zeros(0, self.latent_dim)
+        self.taught: nn.Module | None = None
+        self.kept_share: float | None = None  # of the latents outside U, what can be kept under the observed errors
+        self.told: int | None = None  # round of which this is in the log
+        self.best: dict[str, Any] | None = None
+        self.checks: list[Check] = []
+        self.level = 0.0  # {B <= level} is the set
+        self.warnings: list[str] = []
+        self.skip = False  # nothing more can be done on these latents
+        self.cache: dict[str, Any] = {}  # what a phase can compute again
+        self.begin()
+
+    def begin(self) -> None:
+        """Take the weights that the joint training has reached."""
+        self.networks = nn.ModuleDict({k: copy.deepcopy(net).cpu() for k, net in self.originals.items()})
+
+    @property
+    def dynamics(self) -> Any:
+        """(latent, action) -> next latent."""
+        return self.networks["dynamics"]
+
+    @property
+    def barrier(self) -> Any:
+        """Latent -> barrier value."""
+        return self.networks["barrier"]
+
+    @property
+    def policy(self) -> Any:
+        """Latent -> action."""
+        return self.networks["policy"]
+
+    @property
+    def latent_dim(self) -> int:
+        """Size p of the latent."""
+        return int(self.originals["dynamics"].latent_dim)  # type: ignore[arg-type]
+
+    @property
+    def lipschitz_bound(self) -> float:
+        """L_B of the barrier."""
+        return float(self.originals["barrier"].lipschitz_bound)  # type: ignore[arg-type]
+
+    @property
+    def action_scale(self) -> list[float]:
+        """Largest action per dimension, physical units."""
+        return self.originals["dynamics"].action_scale.flatten().tolist()  # type: ignore[operator, union-attr]
+
+    def unsafe(self) -> Tensor:
+        """``(n,)`` whether a transition starts in U."""
+        return self.latents["region"][:, 0] == 2
+
+    def agent(self, level: float | None = None) -> Agent:
+        """A frozen copy of the present networks; {B <= level} becomes {B <= 0}."""
+        level = self.level if level is None else level
+        nets = self.dynamics, self.barrier, self.policy
+        return Agent.from_networks(self.encoder, *nets, level=level, description=self.description)
+
+    def keep(self, rank: Any, number: int, level: float) -> None:
+        """Remember the present networks as the best so far."""
+        state = {k: v.clone() for k, v in self.networks.state_dict().items()}
+        self.best = {"rank": list(rank), "round": number, "level": level, "networks": state}
+
+    def finish(self) -> None:
+        """The best networks, or the last ones where none was kept, go back to where they came from."""
+        if self.best is not None:
+            self.networks.load_state_dict(self.best["networks"])
+            self.level = self.best["level"]
+        for name, net in self.originals.items():
+            net.load_state_dict(self.networks[name].state_dict())
+
+    def log(self, row: dict[str, Any]) -> None:
+        """Append a line to ``log.jsonl``, and give its numbers to the logger."""
+        if self.out_dir is not None:
+            with (self.out_dir / LOG_FILE).open("a") as file:
+                file.write(json.dumps({**self.where, **row}) + "\n")
+        log_scalars(self.logger, {k: v for k, v in row.items() if k in METRICS}, self.logged_step)
+
+    def log_once(self, row: dict[str, Any]) -> None:
+        """Log what is computed once a round, and again where a run goes on in the middle of one."""
+        if self.told != self.where["round"]:
+            self.told = self.where["round"]
+            self.log(row)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that cannot be computed again."""
+        return {
+            "networks": self.networks.state_dict(),
+            "latents": dict(self.latents),
+            "counterexamples": self.counterexamples,
+            "taught": None if self.taught is None else self.taught.state_dict(),
+            "best": self.best,
+            "plain": json.dumps(
+                {
+                    "kept_share": self.kept_share,
+                    "told": self.told,
+                    "checks": [vars(c) for c in self.checks],
+                    "level": self.level,
+                    "warnings": self.warnings,
+                    "skip": self.skip,
+                    "budget": {} if self.source is None else self.source.budget,
+                }
+            ),
+            "loop": self.loop.state_dict(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
+        state = _own(state)
+        self.networks.load_state_dict(state["networks"])
+        self.latents, self.counterexamples, self.best = dict(state["latents"]), state["counterexamples"], state["best"]
+        if state["taught"] is not None:
+            self.taught = copy.deepcopy(self.policy).requires_grad_(False)
+            self.taught.load_state_dict(state["taught"])
+        plain = json.loads(state["plain"])
+        self.kept_share, self.level, self.warnings = plain["kept_share"], plain["level"], plain["warnings"]
+        self.skip, self.told = plain["skip"], plain["told"]
+        self.checks = [Check(**c) for c in plain["checks"]]
+        if self.source is not None:
+            self.source.budget.update(plain["budget"])
+        self.loop.load_state_dict(state["loop"])
+
+
+class Phase:
+    """One phase; subclass it and give ``run``, and ``size`` where it takes optimiser steps.
+
+    Args:
+        number: the round that it belongs to.
+
+    Source: none.
+
+    Example:
+        >>> class CountUnsafe(Phase):
+        ...     name = "count"
+        ...     def run(self, work):
+        ...         work.log({"step": 0, "unsafe": int(work.unsafe().sum())})
+        >>> CountUnsafe(1).number
+        1
+    """
+
+    name = "phase"
+
+    def __init__(self, number: int = 0) -> None:
+        self.number = number
+
+    def size(self, work: Workspace) -> int:
+        """Optimiser steps that it takes, at least 1; for the progress bar."""
+        return 1
+
+    def run(self, work: Workspace) -> None:
+        """Do it; after an interruption it is called again, with ``work.loop`` where it was."""
+        raise NotImplementedError
+
+
+class Phases(TrainerHookBase):
+    """Runs phases, in order, when a trainer has collected all of its transitions.
+
+    Args:
+        phases: the phases.
+        work: what they share.
+        progress: show a progress bar.
+
+    Source: paper Algorithm 1; deviation: two time scales.
+
+    Example:
+        >>> Phases([], None).state_dict()["done"]
+        0
+    """
+
+    def __init__(self, phases: Sequence[Phase], work: Any, *, progress: bool = False) -> None:
+        self.phases, self.work, self.progress = list(phases), work, progress
+        self.done, self.resumed = 0, False
+        self.trainer: Any = None
+        self.bar: Any = None  # of the trainer, where it has one for both
+
+    @property
+    def finished(self) -> bool:
+        """Whether all phases are done."""
+        return self.done == len(self.phases)
+
+    @property
+    def begun(self) -> bool:
+        """Whether the first phase is done, or has taken a step."""
+        return self.work is not None and (self.done > 0 or self.work.loop.step > 0)
+
+    @property
+    def steps(self) -> int:
+        """Optimiser steps of all phases."""
+        return sum(phase.size(self.work) for phase in self.phases)
+
+    @property
+    def steps_done(self) -> int:
+        """Optimiser steps taken so far, over all phases."""
+        before = sum(phase.size(self.work) for phase in self.phases[: self.done])
+        return before + (0 if self.finished else self.work.loop.step)
+
+    def __call__(self) -> None:
+        """Runs the phases if the trainer has collected all of its transitions, or was asked to stop."""
+        if self.trainer.collected_frames >= self.trainer.total_frames or self.trainer._stop_training:
+            self.run()
+
+    def run(self) -> None:
+        """Run, or continue, all phases."""
+        if self.finished:
+            return
+        work, base = self.work, 0 if self.trainer is None else self.trainer._optim_count
+        if not self.resumed:
+            self._save(force_save=True)  # the joint training is done
+            work.begin()
+        work.loop.tick = self._tick
+        own_bar = self.bar is None
+        if own_bar:
+            self.bar = tqdm(total=self.steps, initial=self.steps_done, unit="step", disable=not self.progress)
+        before = self.bar.n - self.steps_done
+        rounds = len({phase.number for phase in self.phases}) > 1
+        while not self.finished:
+            phase = self.phases[self.done]
+            work.where = {"phase": phase.name, "round": phase.number}
+            work.logged_step = base + self.steps_done
+            self.bar.set_description(f"{phase.name} {phase.number}" if rounds else phase.name)
+            if not work.skip:
+                phase.run(work)
+            work.loop.restart()
+            self.done += 1
+            self.bar.n = before + self.steps_done
+            self.bar.refresh()
+            if self.finished:
+                work.finish()
+            self._save()
+        if own_bar:
+            self.bar.close()
+
+    def _tick(self) -> None:
+        self.bar.update()
+        self.work.logged_step += 1
+        self._save()
+
+    def _save(self, **options: Any) -> None:
+        if self.trainer is not None:
+            self.trainer.save_trainer(**options)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Which phases are done, and the workspace once the first has begun."""
+        return {"done": self.done, "begun": self.begun, "work": self.work.state_dict() if self.begun else None}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
+        self.done, self.resumed = int(state["done"]), bool(state["begun"])
+        if self.resumed:
+            self.work.load_state_dict(state["work"])
+
+    def register(self, trainer: Trainer, name: str = "phases") -> None:
+        """Attaches the hook to ``post_steps``."""
+        self.trainer = trainer
+        trainer.register_op("post_steps", self)
+        trainer.register_module(name, self)
+
+
+def _plain(schedule: Any) -> dict[str, Any]:
+    """State of a schedule without what is no number (OneCycleLR keeps a bound method)."""
+    return {k: v for k, v in schedule.state_dict().items() if not callable(v)}
+
+
+def _own(value: Any) -> Any:
+    """Copies of tensors that lie in a checkpoint's files."""
+    if isinstance(value, Tensor):
+        return torch.empty_like(value, memory_format=torch.contiguous_format).copy_(value)
+    if isinstance(value, Mapping):
+        return {k: _own(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return type(value)(_own(v) for v in value)
+    return value
+
+
+__all__ = ["Check", "InnerLoop", "Phase", "Phases", "Workspace"]

@@ -1,0 +1,157 @@
+"""The phases that end a round: held-out checks, and the level at which the set is what was asked for."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.evaluation.controllers import AgentController, RandomController
+from torchrl_sspl.evaluation.episodes import separating_level
+from torchrl_sspl.evaluation.known import encode_states
+from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.seeds import spawn
+from torchrl_sspl.sets import UNSAFE
+from torchrl_sspl.trainers.phases import Check, Phase, Workspace
+
+_HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
+_LOWEST_LEVEL = -0.2
+_MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away from what the set tolerates
+_UNSAFE_DRAWS = 32_000  # fresh observations of U, at most
+_BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
+
+
+@dataclass
+class _HeldOut:
+    """What a round is judged by: barrier values of fresh observations, and fresh episodes."""
+
+    unsafe: Tensor
+    safe: Tensor
+    anywhere: Tensor
+    episodes: Episodes
+    back: Episodes
+
+
+class CheckRound(Phase):
+    """Held-out checks of a round; the level is moved to the largest set that passes them.
+
+    The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations of U
+    for every episode, 32,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim, in the first
+    steps, so many short episodes say more than few long ones.
+
+    Source: none; the paper stops at a total loss of zero.
+    """
+
+    name = "check"
+
+    def run(self, work: Workspace) -> None:
+        """Append to ``work.checks``; keep the networks if they are the best that has passed."""
+        agent = work.agent(0.0)
+        held_out = self._held_out(work, agent)
+        if held_out is None:
+            found = Check(self.number, 0.0, 0, 0, 0, 0, 0.0, 0.0, False, "the set is empty")
+        else:
+            levels = torch.linspace(_LOWEST_LEVEL, _HIGHEST_LEVEL, 57).flip(0).tolist()
+            lowest = -_MOST_OF_MARGIN * work.config.margin - 1e-6  # below it the condition says nothing of the level
+            checks = (self._check(work, held_out, level) for level in levels if level >= lowest)
+            found = next((c for c in checks if c.passed), None) or self._check(work, held_out, 0.0)
+        work.checks.append(found)
+        work.log({"step": self.number, **{k: v for k, v in vars(found).items() if not isinstance(v, str)}})
+        # Of the sets that passed, one into which starts in U return counts first, then the largest.
+        rank = [float(found.returned >= work.config.return_share), found.size]
+        if found.passed and (work.best is None or rank >= list(work.best["rank"])):
+            work.keep(rank, self.number, found.level)
+
+    def _held_out(self, work: Workspace, agent: Agent) -> _HeldOut | None:
+        s, source = work.config, work.source
+        assert source is not None
+        env, n = source.env, s.check_episodes
+        generator = torch.Generator().manual_seed(spawn(work.seed, "checks", self.number))
+
+        def values(states: Tensor) -> Tensor:
+            return agent.barrier(encode_states(agent, env, states))[:, 0]
+
+        unsafe = values(env.sample_states(min(8 * n, _UNSAFE_DRAWS), generator, region=env.unsafe_set))
+        safe = values(env.sample_states(n, generator, region=env.safe_set))
+        states = env.sample_states(3 * n, generator, region=source.outside_unsafe)
+        anywhere = values(states)
+        start = states[anywhere <= _HIGHEST_LEVEL][:n]
+        if not len(start):
+            return None
+        episodes = simulate(agent, env, start=start, horizon=s.check_horizon)
+        back_from = env.sample_states(min(max(1, n // 4), _BACK[0]), generator, region=env.unsafe_set)
+        back = simulate(agent, env, start=back_from, horizon=max(2 * s.check_horizon, _BACK[1]))
+        return _HeldOut(unsafe, safe, anywhere, episodes, back)
+
+    def _check(self, work: Workspace, held_out: _HeldOut, level: float) -> Check:
+        s, run, back = work.config, held_out.episodes, held_out.back
+        assert run.barrier is not None
+        assert back.barrier is not None
+        late = (run.region == UNSAFE).flip(0).cumsum(0).flip(0) > 0  # in U now or later
+        inside = run.barrier[0] <= level
+        left = int((inside & (run.barrier[1:] > level).any(0)).sum())
+        touched = int(((run.barrier <= level) & late).any(0).sum())
+        bad, out = int((held_out.unsafe <= level + s.guard).sum()), int((held_out.safe > level).sum())
+        returned = float(((back.barrier[-1] <= level) & (back.region[-1] != UNSAFE)).float().mean())
+        size = float((held_out.anywhere <= level).float().mean())
+        tolerated = s.leave_share * int(inside.sum())
+        counts = (("unsafe inside", bad, 0), ("safe outside", out, 0), ("left", left, tolerated), ("touched U", touched, 0))
+        faults = [f"{name} {found}" for name, found, most in counts if found > most]
+        passed = not faults and size > 0
+        return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults))
+
+
+class PlaceLevel(Phase):
+    """The zero level between held-out observations of U and S, for systems that are known by being run only.
+
+    Args:
+        number: the round that it belongs to.
+        episodes: under the policy, and as many under random actions.
+        horizon: steps per episode.
+        envs: environments stepped together.
+        progress: show progress bars.
+
+    Source: none.
+    """
+
+    name = "level"
+
+    def __init__(self, number: int = 0, *, episodes: int = 200, horizon: int = 50, envs: int = 20, progress: bool = False) -> None:
+        super().__init__(number)
+        self.episodes, self.horizon, self.envs, self.progress = episodes, horizon, envs, progress
+
+    def run(self, work: Workspace) -> None:
+        """Set ``work.level``."""
+        work.level = self.place(work)
+        work.log({"step": self.number, "level": work.level})
+
+    def place(self, work: Workspace) -> float:
+        """The level."""
+        s, source = work.config, work.source
+        assert source is not None
+        seed, agent = spawn(work.seed, "level", self.number), work.agent(0.0)
+        device = next(work.encoder.parameters()).device
+        env = source.make_env(batch_size=[self.envs], seed=seed)
+        label = "zero level" if self.progress else None
+        agent = agent.to(device)
+        chance = AgentController(agent, driver=RandomController.within(env, spawn(work.seed, "level", 1000 + self.number)))
+        try:
+            run: dict[str, Any] = {"episodes": self.episodes, "horizon": self.horizon, "label": label}
+            held_out = [simulate(acts, env, **run) for acts in (agent, chance)]
+        finally:
+            env.close()
+        level = separating_level(held_out, s.guard, 0.0 if work.skip else s.margin)
+        first = held_out[0].barrier
+        if level < 0.0 and first is not None and not bool((first[0] <= level).any()):
+            work.warnings.append(
+                f"no held-out reset lies in the set: its level was lowered to {level:.3g} to leave out every held-out observation "
+                "of U. Some of these look like S to the encoder: collect more data (trainer.total_frames), above all in U "
+                "(reset_options), show more of the motion (image_size), or try another seed"
+            )
+        return level
+
+
+__all__ = ["CheckRound", "PlaceLevel"]

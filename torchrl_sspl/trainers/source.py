@@ -1,0 +1,195 @@
+"""Where the phases get encoded transitions from: the joint training's store, and further collection through TorchRL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from torch import Tensor, nn
+from torchrl.envs import EnvBase
+
+from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
+from torchrl_sspl.data.collect import ExploringPolicy
+from torchrl_sspl.data.encoding import encode_transitions
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.modules import make_rollout_policy
+from torchrl_sspl.seeds import spawn
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Mixture, Region
+
+_CHUNK = 4096  # transitions whose pictures are held at a time
+
+Latents = dict[str, Tensor]
+
+
+def starts_of(env: SafetyEnv, shares: Sequence[float]) -> Region:
+    """Where episodes start: anywhere, outside U, in S and in U, in given shares.
+
+    Args:
+        env: knows its sets.
+        shares: four numbers.
+
+    Returns:
+        The mixture.
+
+    Source: paper Section IV (S, U and D are sampled apart).
+    """
+    return Mixture([env.state_space, env.state_space - env.unsafe_set, env.safe_set, env.unsafe_set], shares)
+
+
+class TrainingStarts:
+    """Environments for training: where the sets are known, episodes start in them in given shares.
+
+    Args:
+        make_env: ``(batch_size=[n], seed=...) -> environment``.
+        batch_size: ``[n]``.
+        shares: see :func:`starts_of`.
+
+    Source: none.
+    """
+
+    def __init__(self, make_env: Callable[..., EnvBase], batch_size: list[int], shares: Sequence[float]) -> None:
+        self.make_env, self.batch_size, self.shares = make_env, batch_size, list(shares)
+
+    def __call__(self, seed: int | None = None) -> EnvBase:
+        """An environment; others than those of this library start as they always do."""
+        env = self.make_env(batch_size=self.batch_size, seed=seed)
+        if isinstance(env, SafetyEnv):
+            env.initial_set = starts_of(env, self.shares)
+        return env
+
+
+class Source:
+    """Encoded transitions for the phases, from pictures, actions and labels; counts what it has taken.
+
+    Args:
+        make_env: ``(batch_size=[n], seed=...) -> environment`` with ``"pixels"`` and ``"region"``.
+        encoder: pixels -> latent, where it is being trained.
+        store: transitions of the joint training; ``None``: everything is collected anew.
+        starts: shares of the episodes that start anywhere, outside U, in S, in U, where the environment knows its sets.
+        steps: longest episode under random actions; ``None`` leaves that to the environment.
+        envs: environments stepped together.
+        seed: seed of all collections.
+
+    Source: paper Algorithm 1 (D grows by rollouts of the policy); deviation: labels of the rollouts are used too.
+    """
+
+    def __init__(
+        self,
+        make_env: Callable[..., EnvBase],
+        encoder: nn.Module,
+        *,
+        store: TransitionStore | None = None,
+        starts: Sequence[float] = (0.5, 0.0, 0.5, 0.0),
+        steps: int | None = 4,
+        envs: int = 256,
+        seed: int = 0,
+    ) -> None:
+        self.make_env, self.encoder, self.store = make_env, getattr(encoder, "module", encoder), store
+        self.starts, self.steps, self.envs, self.seed = list(starts), steps, envs, seed
+        self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
+        self._env: EnvBase | None = None
+
+    @property
+    def env(self) -> Any:
+        """One environment of the system; for what it knows, not for stepping."""
+        if self._env is None:
+            self._env = self.make_env(batch_size=[1], seed=self.seed)
+        return self._env
+
+    @property
+    def known(self) -> bool:
+        """Whether the environment knows its sets, so that episodes can start in them."""
+        return isinstance(self.env, SafetyEnv)
+
+    @property
+    def outside_unsafe(self) -> Region:
+        """The states that carry no label of U."""
+        return self.env.state_space - self.env.unsafe_set
+
+    def count(self, store: TransitionStore) -> None:
+        """Adds what a store holds to the budget."""
+        n, region = len(store), store.region
+        self.budget["transitions"] += n
+        self.budget["labels of S"] += int((region == SAFE).sum())
+        self.budget["labels of U"] += int((region == UNSAFE).sum())
+        self.budget["resets"] += (store.n_frames - n) // 2  # an episode has two frames more than transitions
+
+    def stored(self, most: int) -> Latents | None:
+        """Latents of the joint training's transitions.
+
+        Args:
+            most: of more than that, those of S and U first, up to half, and others at random.
+
+        Returns:
+            The latents; ``None`` without a store.
+        """
+        if self.store is None or not len(self.store):
+            return None
+        self.count(self.store)
+        n = len(self.store)
+        index = torch.arange(n)
+        if n > most:
+            mixed = torch.randperm(n, generator=torch.Generator().manual_seed(self.seed))
+            first = mixed[self.store.region[mixed] != UNLABELLED][: most // 2]
+            index = torch.cat([first, mixed[~torch.isin(mixed, first)][: most - len(first)]])
+        return encode_transitions(self._encode, self.store, index)
+
+    def random(self, n: int, index: int, *, region: Region | None = None, steps: int | None = None) -> Latents:
+        """Latents of n transitions under random actions.
+
+        Args:
+            n: how many.
+            index: number of this collection within its round's seeds.
+            region: where episodes start; by default the shares ``starts``.
+            steps: longest episode, in place of the source's.
+        """
+
+        def draw(env: EnvBase, size: int, seed: int) -> TransitionStore:
+            where = region or (starts_of(env, self.starts) if isinstance(env, SafetyEnv) else None)
+            return collect_random(env, size, seed=seed, steps=steps or self.steps, region=where)
+
+        return self._in_chunks(draw, n, index)
+
+    def under(self, policy: nn.Module, n: int, index: int, *, exploration: float, region: Region | None = None) -> Latents:
+        """Latents of n transitions under a policy with noise on its actions; other arguments as for :meth:`random`."""
+        device = next(self.encoder.parameters()).device
+        acting = make_rollout_policy(self.encoder, policy.to(device))
+        space = self.env.action_spec_unbatched.space
+        exploring = ExploringPolicy(acting, space.low.cpu().float(), space.high.cpu().float(), exploration, 0.0).to(device)
+
+        def draw(env: EnvBase, size: int, seed: int) -> TransitionStore:
+            devices: dict[str, Any] = {}
+            if device.type != "cpu":
+                devices = {"policy_device": device, "env_device": "cpu", "storing_device": "cpu"}
+            with torch.random.fork_rng():
+                torch.manual_seed(seed)
+                return collect_rollouts(env, exploring, size, seed=seed, steps=self.steps, region=region, **devices)
+
+        try:
+            return self._in_chunks(draw, n, index)
+        finally:
+            policy.cpu()
+
+    def _in_chunks(self, draw: Callable[[EnvBase, int, int], TransitionStore], n: int, index: int) -> Latents:
+        env = self.make_env(batch_size=[min(self.envs, n)], seed=self.seed)
+        parts = []
+        for k, size in enumerate(c.numel() for c in torch.arange(n).split(_CHUNK)):
+            store = draw(env, size, spawn(self.seed, "rounds", 1000 * index + k))
+            store.pixel_views = not hasattr(self.encoder, "sequence")
+            self.count(store)
+            parts.append(encode_transitions(self._encode, store))
+        if not isinstance(env, SafetyEnv):
+            env.close()
+        return {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
+
+    @torch.no_grad()
+    def _encode(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+        device = next(self.encoder.parameters()).device
+        if hasattr(self.encoder, "sequence"):
+            return self.encoder.sequence(batch["frames"].to(device)).unbind(1)  # type: ignore[operator]
+        return self.encoder(batch["pixels"].to(device)), self.encoder(batch["next", "pixels"].to(device))
+
+
+__all__ = ["Source", "TrainingStarts", "starts_of"]

@@ -1,0 +1,492 @@
+r"""The phases on frozen latents: data, dynamics, what can be kept, barrier and policy, fine-tuning on the condition.
+
+In each round: :class:`Gather` encodes transitions, :class:`FitDynamics` fits the latent dynamics to them,
+:class:`TeachPolicy` (teacher "value") teaches the policy the values of its actions, :class:`FitSets` regresses barrier and
+policy onto the largest robust invariant set of the cloud of latents (or the margin that the taught policy keeps),
+:class:`SteerPolicy` and :class:`FineTune` train on the condition
+:math:`B(z) \le 0 \Rightarrow B(d(z, \pi(z)) + e) + m \le 0` under the observed errors e. Checks follow
+(:mod:`torchrl_sspl.trainers.selection`).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDict
+from torch import Tensor, nn
+
+from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
+from torchrl_sspl.configs.schema import SynthesisConfig
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, SynthesisLoss, TargetLoss
+from torchrl_sspl.objectives.base import LatentBatch
+from torchrl_sspl.sets import SAFE, UNSAFE
+from torchrl_sspl.trainers.phases import Phase, Workspace
+from torchrl_sspl.viability.cloud import (
+    barrier_targets,
+    nearby_residuals,
+    nearest_distance,
+    normal_projectors,
+    reach_times,
+    robust_invariant_set,
+    safety_values,
+    signed_margin,
+    value_targets,
+)
+
+_KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
+_VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
+_SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerated, the first that keeps S
+_KEPT_OF_SAFE = 0.9
+_MOST_ACTIONS = 729  # in the grid that is tried at every latent
+_SEARCH_EVERY = 250  # steps between two searches for counterexamples
+_NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
+
+
+class Gather(Phase):
+    """Encoded transitions: those of the joint training and random actions in the first round, the policy's own afterwards.
+
+    Where the environment knows its sets, further rounds add transitions of the exploring policy that start in the set or
+    near it, and of many that start in U those whose pictures the present barrier puts lowest: the rim of U is where a set
+    goes wrong first. Elsewhere they add episodes of the exploring policy from the environment's own resets.
+
+    Source: paper Algorithm 1 (rollouts join D); deviation: which of them are kept is decided by their pictures.
+    """
+
+    name = "gather"
+
+    def run(self, work: Workspace) -> None:
+        """Extend ``work.latents``."""
+        s, source = work.config, work.source
+        if source is None:
+            return  # they were given
+        if self.number == 0:
+            stored = source.stored(s.transitions)
+            missing = s.transitions - (0 if stored is None else len(stored["latent"]))
+            parts = [] if stored is None else [stored]
+            if missing > 0 and (source.known or stored is None):
+                parts.append(source.random(missing, 0))
+        else:
+            parts = [work.latents, self._near_the_set(work)]
+            if source.known and s.rim_transitions:
+                parts.append(self._rim(work))
+        work.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
+        work.cache.clear()
+        unsafe = work.unsafe()
+        if not bool(unsafe.any()) or bool(unsafe.all()):
+            work.warnings.append(
+                f"policy and barrier are those of the joint training: {int(unsafe.sum())} of {len(unsafe)} transitions start in "
+                "U, and what follows needs both kinds"
+            )
+            work.skip = True
+
+    def _near_the_set(self, work: Workspace) -> dict[str, Tensor]:
+        s, source = work.config, work.source
+        assert source is not None
+        region = source.outside_unsafe if source.known else None
+        found: list[dict[str, Tensor]] = []
+        count = 0
+        for attempt in range(10):
+            part = source.under(
+                work.policy, s.rollout_transitions, 20 * self.number + attempt, exploration=s.exploration, region=region
+            )
+            with torch.no_grad():
+                near = work.barrier(part["latent"])[:, 0] < _NEAR
+            found.append({k: v[near] for k, v in part.items()})
+            count += int(near.sum())
+            if count >= s.rollout_transitions or not source.known:
+                break
+        return {k: torch.cat([f[k] for f in found])[: s.rollout_transitions] for k in found[0]}
+
+    @torch.no_grad()
+    def _rim(self, work: Workspace) -> dict[str, Tensor]:
+        s, source = work.config, work.source
+        assert source is not None
+        drawn = source.random(s.rim_draws * s.rim_transitions, 20 * self.number + 10, region=source.env.unsafe_set, steps=1)
+        lowest = work.barrier(drawn["latent"])[:, 0].topk(s.rim_transitions, largest=False).indices
+        return {k: v[lowest] for k, v in drawn.items()}
+
+
+class FitDynamics(Phase):
+    """Dynamics on frozen latents; off the manifold they lead back to it.
+
+    Source: paper eq. (8), third term; deviation: the worst errors count extra, so do latents off the manifold.
+    """
+
+    name = "dynamics"
+
+    def size(self, work: Workspace) -> int:
+        """Half of the steps in further rounds."""
+        steps = work.config.dynamics_steps
+        return steps if self.number == 0 else steps // 2
+
+    def run(self, work: Workspace) -> None:
+        """Train ``work.dynamics``."""
+        s, data = work.config, work.latents
+        tube, base = off_manifold(work, data["latent"], 1.3 * s.tube_radius, self.number)
+        on, off = 2 * s.batch // 6, s.batch // 6
+        loss = ConsistencyLoss(work.dynamics, unsafe_weight=s.unsafe_weight, worst_coeff=0.2, worst_fraction=0.05)
+
+        latent, after, action, region = (data[k] for k in ("latent", "next_latent", "action", "region"))
+
+        def step() -> dict[str, Tensor]:
+            a, c = work.loop.pick(len(latent), on), work.loop.pick(len(tube), off) if len(tube) else None
+            z, index = latent[a], a
+            if c is not None:
+                z, index = torch.cat([z, tube[c]]), torch.cat([a, base[c]])
+            return loss.terms(LatentBatch(z, next_latent=after[index], action=action[index], region=region[index]))
+
+        work.loop(self.size(work), {work.dynamics: 3e-3 if self.number == 0 else 2e-3}, step)
+
+
+class TeachPolicy(Phase):
+    """The policy alone, on the values of its actions; what it then keeps is what the barrier is taught.
+
+    Source: none; the paper descends on the barrier.
+    """
+
+    name = "teach"
+
+    def size(self, work: Workspace) -> int:
+        """Half of the steps in further rounds."""
+        steps = work.config.teach_steps
+        return steps if self.number == 0 else steps // 2
+
+    def run(self, work: Workspace) -> None:
+        """Train ``work.policy``, keep a copy in ``work.taught``."""
+        s, z, unsafe = work.config, work.latents["latent"], work.unsafe()
+        g = torch.Generator().manual_seed(work.seed + 99_000 + self.number)
+        actions = action_grid(work.action_scale, s.actions)
+        _, axes = observed_errors(work, z, g, s.teach_spread)
+        following = successors(work, z, actions)
+        value = safety_values(following, z, signed_margin(z, unsafe), residuals=axes)
+        # In U nothing can be kept any more: the soonest way out.
+        value[unsafe] = -_VALUE_SCALE * reach_times(following[unsafe], z[unsafe], z[~unsafe])
+        loss = ActionValueLoss(
+            work.policy, action_scale=work.action_scale, scale=_VALUE_SCALE, worst_coeff=0.3, worst_fraction=0.05
+        )
+
+        def step() -> dict[str, Tensor]:
+            rows = work.loop.pick(len(z), s.batch)
+            return loss.terms(LatentBatch(z[rows]), value[rows])
+
+        work.loop(self.size(work), {work.policy: 3e-3}, step)
+        work.taught = copy.deepcopy(work.policy).requires_grad_(False)
+
+
+class FitSets(Phase):
+    """Barrier and policy onto the robust invariant set of the encoded data.
+
+    Source: none; the paper trains the barrier on the condition from the start.
+    """
+
+    name = "fit"
+
+    def size(self, work: Workspace) -> int:
+        """Half of the steps in further rounds."""
+        steps = work.config.fit_steps
+        return steps if self.number == 0 else steps // 2
+
+    def run(self, work: Workspace) -> None:
+        """Train ``work.barrier`` and ``work.policy``."""
+        table, _ = targets(work, self.number)
+        loss = TargetLoss(
+            work.barrier, work.policy, action_scale=work.action_scale, scale=0.1, worst_coeff=0.3, worst_fraction=0.05
+        )
+        rates = {work.barrier: 5e-3 if self.number == 0 else 2e-3, work.policy: 3e-3}
+        work.loop(self.size(work), rates, lambda: loss(table[work.loop.pick(len(table), work.config.batch)]))
+
+
+class FineTune(Phase):
+    """Barrier and policy together, on the condition under observed errors, the labels and the targets.
+
+    Source: paper eq. (10); deviation: condition R3 in place of a decrease everywhere.
+    """
+
+    name = "tune"
+
+    def size(self, work: Workspace) -> int:
+        """All of them in every round."""
+        return work.config.tune_steps
+
+    def rates(self, work: Workspace) -> dict[nn.Module, float]:
+        """What is trained, with its peak learning rate."""
+        return {work.barrier: work.config.lr, work.policy: work.config.lr}
+
+    def margin(self, config: SynthesisConfig) -> float:
+        """m of the condition."""
+        return config.margin
+
+    def run(self, work: Workspace) -> None:
+        """Train on the condition."""
+        s = work.config
+        table, rim = targets(work, self.number)
+        unsafe = (table["region"][:, 0] == UNSAFE).nonzero()[:, 0]
+        # Half of the rows of U come from its rim, the sixth that lies nearest to the set.
+        nearest = table["barrier_target"][unsafe, 0].argsort()[: max(1, len(unsafe) // 6)]
+        safe = (table["region"][:, 0] == SAFE).nonzero()[:, 0]
+        table = table.clone(False)
+        table["action_weight"] = table["action_weight"] * torch.where(table["inside"], 0.1, 1.0)
+        condition, target = self._losses(work)
+        # What the sets hold counts more than its share of the data; S may be empty.
+        shares = ((unsafe, s.batch // 2), (unsafe[nearest], s.batch // 2), (safe, s.batch // 4))
+        pick = work.loop.pick
+
+        def step() -> TensorDict:
+            drawn = [pick(len(table), s.batch)]
+            drawn += [rows[pick(len(rows), n)] for rows, n in shares if len(rows)]
+            asked = rim[pick(len(rim), 3 * s.batch // 2)]
+            error = asked["residual"][torch.arange(len(asked)), pick(s.residuals, len(asked))]
+            asked = asked.exclude("residual").set("residual", error)
+            if s.counterexamples:
+                asked = self._with_counterexamples(work, asked)
+            terms = condition(asked)
+            terms.update(target(table[torch.cat(drawn)]))
+            return terms
+
+        work.loop(self.size(work), self.rates(work), step)
+
+    def _losses(self, work: Workspace) -> tuple[SynthesisLoss, TargetLoss]:
+        s = work.config
+        condition = SynthesisLoss(
+            None, work.dynamics, work.barrier, work.policy, mode="R3", dynamics_margin=self.margin(s), band=s.band,
+            worst_coeff=1.0, worst_fraction=0.02, off_manifold_coeff=1.0,
+        )  # fmt: skip
+        target = TargetLoss(
+            work.barrier, work.policy, action_scale=work.action_scale, outside_cap=s.band, policy_coeff=s.recovery_coeff,
+            safety_margin=s.unsafe_margin, inside_coeff=2.0, unsafe_coeff=10.0, safe_coeff=1.0, worst_coeff=1.0,
+            worst_fraction=0.02,
+        )  # fmt: skip
+        return condition, target
+
+    def _with_counterexamples(self, work: Workspace, asked: TensorDict) -> TensorDict:
+        """Adds latents of the whole domain at which the condition fails; they are searched for again and again."""
+        s, step = work.config, work.loop.step
+        if step % _SEARCH_EVERY == 0:
+            nets = work.barrier, work.dynamics, work.policy
+            system = closed_loop(*nets, latent_dim=work.latent_dim, lipschitz_bound=work.lipschitz_bound)
+            found = find_counterexamples(system, s.counterexamples, margin=s.margin, generator=work.loop.generator)
+            known = found if step == 0 else torch.cat([found, work.counterexamples])
+            work.counterexamples = known[: 8 * s.counterexamples]
+        if not len(work.counterexamples):
+            return asked
+        latent = work.counterexamples[work.loop.pick(len(work.counterexamples), len(asked) // 4)]
+        hard = TensorDict(latent=latent, residual=torch.zeros_like(latent), batch_size=[len(latent)])
+        return torch.cat([asked, hard])
+
+
+class SteerPolicy(FineTune):
+    """The policy alone, on the condition with twice the margin."""
+
+    name = "steer"
+
+    def size(self, work: Workspace) -> int:
+        """All of them in every round."""
+        return work.config.steer_steps
+
+    def rates(self, work: Workspace) -> dict[nn.Module, float]:
+        """The policy."""
+        return {work.policy: 3e-3}
+
+    def margin(self, config: SynthesisConfig) -> float:
+        """Twice m."""
+        return 2 * config.margin
+
+
+def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
+    """The phases of every round.
+
+    Args:
+        config: gives the number of rounds and the teacher.
+        check: ``round -> phase`` that ends every round, such as
+            :class:`~torchrl_sspl.trainers.selection.CheckRound`; ``None``: nothing is checked.
+
+    Returns:
+        The phases in order; leave some out, or put your own between them.
+
+    Source: paper Algorithm 1.
+
+    Example:
+        >>> [phase.name for phase in synthesis_phases(SynthesisConfig())]
+        ['gather', 'dynamics', 'teach', 'fit', 'steer', 'tune']
+    """
+    teach = [TeachPolicy] if config.teacher == "value" else []
+    kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, SteerPolicy, FineTune, *([check] if check else [])]
+    return [kind(k) for k in range(config.rounds) for kind in kinds]
+
+
+# ---------------------------------------------------------------------- targets
+
+
+def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
+    """A regular grid of actions, coarser where many dimensions would make it too large.
+
+    Args:
+        action_scale: largest action per dimension, physical units.
+        per_dimension: actions per dimension.
+
+    Returns:
+        ``(k, m)``.
+
+    Raises:
+        ConfigError: the action has too many dimensions.
+
+    Source: none.
+
+    Example:
+        >>> action_grid([2.0], 3)[:, 0].tolist()
+        [-2.0, 0.0, 2.0]
+    """
+    m = len(action_scale)
+    k = max(2, min(per_dimension, int(_MOST_ACTIONS ** (1 / m) + 1e-6)))
+    if k**m > 8 * _MOST_ACTIONS:
+        raise ConfigError(
+            f"expected at most {int(math.log2(8 * _MOST_ACTIONS))} action dimensions, received {m}: a grid of actions is "
+            "tried at every latent; set synthesis.enabled=false to keep what the joint training has found"
+        )
+    axes = [torch.linspace(-scale, scale, k) for scale in action_scale]
+    return torch.cartesian_prod(*axes).reshape(-1, m)
+
+
+@torch.no_grad()
+def off_manifold(work: Workspace, latent: Tensor, radius: float, salt: int) -> tuple[Tensor, Tensor]:
+    """Latents moved off the data manifold along its normals, and the rows that they came from."""
+    g = torch.Generator().manual_seed(work.seed + 77_000 + salt)
+    cloud = _cloud(work, g)
+    normal = normal_projectors(latent, cloud[:20000])
+    direction = (normal @ torch.randn(*latent.shape, 1, generator=g))[..., 0]
+    length = direction.norm(dim=-1, keepdim=True)
+    moved = radius * torch.rand(len(latent), 1, generator=g)
+    points = (latent + moved * direction / length.clamp_min(1e-6)).clamp(-1, 1)
+    # Where another sheet of the manifold is nearer than the one it came from, a point says nothing.
+    kept = (length[:, 0] > 1e-3) & (nearest_distance(points, cloud) > 0.85 * moved[:, 0])
+    rows = kept.nonzero()[:, 0]
+    return points[rows], rows
+
+
+def _cloud(work: Workspace, generator: torch.Generator) -> Tensor:
+    cloud = torch.cat([work.latents["latent"], work.latents["next_latent"]])
+    return cloud[torch.randperm(len(cloud), generator=generator)[:80000]]
+
+
+def observed_errors(work: Workspace, latent: Tensor, generator: torch.Generator, spread: float) -> tuple[Tensor, Tensor]:
+    """Errors of the dynamics observed near latents: a sample of them, and their principal axis."""
+    data = work.latents
+    z = data["latent"]
+    with torch.no_grad():
+        residual = data["next_latent"] - work.dynamics(z, data["action"])
+    sample = torch.randperm(len(z), generator=generator)[:30000]
+    return nearby_residuals(latent, z[sample], residual[sample], count=work.config.residuals, spread=spread)
+
+
+@torch.no_grad()
+def successors(work: Workspace, latent: Tensor, actions: Tensor) -> Tensor:
+    """``(n, k, p)`` next latents under every action of a table."""
+    k = len(actions)
+    parts = [
+        work.dynamics(part.repeat_interleave(k, 0), actions.repeat(len(part), 1)).reshape(len(part), k, -1)
+        for part in latent.split(4096)
+    ]
+    return torch.cat(parts)
+
+
+def targets(work: Workspace, number: int) -> tuple[TensorDict, TensorDict]:
+    """Latents with the targets of barrier and policy, and the latents on which the condition is asked; computed once a round."""
+    if "targets" not in work.cache:
+        s, data = work.config, work.latents
+        g = torch.Generator().manual_seed(work.seed + 88_000 + number)
+        z, unsafe = data["latent"], work.unsafe()
+        zc = z[~unsafe]
+        near, axes = observed_errors(work, zc, g, s.residual_spread)
+        stray = torch.rand(60000, z.shape[1], generator=g) * 2 - 1
+        tube, _ = off_manifold(work, z, 2 * s.tube_radius, 1000 + number)
+        rim, rows = off_manifold(work, zc, 1.2 * s.tube_radius, 2000 + number)
+        queries = torch.cat([z, data["next_latent"], tube, stray])
+        if s.teacher == "value":
+            target, member, best, weight = _value_targets(work, queries, axes)
+        else:
+            target, member, best, weight = _clearance_targets(work, queries, stray, axes, g)
+        rest = len(queries) - len(z)
+        table = TensorDict(
+            latent=queries,
+            barrier_target=target[:, None],
+            inside=member[:, None],
+            action_target=torch.cat([best, torch.zeros(rest, best.shape[1])]),
+            action_weight=torch.cat([weight, torch.zeros(rest)])[:, None],
+            region=torch.cat([data["region"], torch.zeros(rest, 1, dtype=torch.int64)]),
+            batch_size=[len(queries)],
+        )
+        asked = TensorDict(
+            latent=torch.cat([zc, rim]), residual=torch.cat([near, near[rows]]), batch_size=[len(zc) + len(rim)]
+        )
+        work.cache["targets"] = table, asked
+    return work.cache["targets"]
+
+
+def _clearance_targets(
+    work: Workspace, queries: Tensor, stray: Tensor, errors: Tensor, generator: torch.Generator
+) -> tuple[Tensor, ...]:
+    """Signed distance to the robust invariant set; actions that keep the largest clearance, or lead back soonest."""
+    s, z, unsafe = work.config, work.latents["latent"], work.unsafe()
+    zc, actions = z[~unsafe], action_grid(work.action_scale, s.actions)
+    found = robust_invariant_set(successors(work, zc, actions), zc, z[unsafe], residuals=errors)
+    kept = found.inside
+    if not bool(kept.any()):
+        # Nothing can be kept under these errors: go on with what can be kept longest, and let the held-out
+        # checks say what it is worth.
+        kept = found.removed == found.removed.max()
+    inside = torch.zeros(len(z), dtype=torch.bool)
+    inside[(~unsafe).nonzero()[:, 0]] = kept
+    far = nearest_distance(stray, _cloud(work, generator)) > s.tube_radius
+    outer_points = torch.cat([z[~inside], stray[far]])
+    bounds = {"tube_radius": s.tube_radius, "lipschitz_bound": work.lipschitz_bound}
+    target, member = barrier_targets(queries, z[inside], outer_points, **bounds)
+    best = torch.zeros(len(z), len(work.action_scale))
+    best[inside] = torch.softmax(found.clearance[kept] / 0.01, 1) @ actions
+    outer = (~inside).nonzero()[:, 0]
+    times = reach_times(successors(work, z[outer], actions), z[outer], z[inside], known_within=_KNOWN_WITHIN)
+    best[outer] = torch.softmax(-times / 0.1, 1) @ actions
+    weight = torch.ones(len(z))
+    weight[outer] = (times.min(1).values < 100).float()
+    work.kept_share = float(found.inside.float().mean())
+    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
+    return target, member, best, weight
+
+
+@torch.no_grad()
+def _value_targets(work: Workspace, queries: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
+    """Minus the margin that the taught policy keeps, and the taught policy itself."""
+    s, data = work.config, work.latents
+    taught = work.taught or work.policy
+    z, unsafe, safe = data["latent"], work.unsafe(), data["region"][:, 0] == SAFE
+    action = taught(z)
+    margin = signed_margin(z, unsafe)
+    following, mean = work.dynamics(z, action)[:, None], errors[:, :1]
+    for share in _SPREADS:
+        # What looks unsafe ends there, whatever follows: no errors are needed for it.
+        around = torch.zeros(len(z), *errors.shape[1:])
+        around[~unsafe] = torch.lerp(mean, errors, share)
+        value = safety_values(following, z, margin, residuals=around)[:, 0].minimum(margin)
+        # A set without S is worth nothing: rather tolerate less.
+        if int((value[safe] > 0).sum()) >= _KEPT_OF_SAFE * int(safe.sum()):
+            break
+    target = value_targets(queries, z, value, tube_radius=s.tube_radius, lipschitz_bound=work.lipschitz_bound)
+    work.kept_share = float((value[~unsafe] > 0).float().mean())
+    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "spread": share * s.residual_spread})
+    return target, target <= 0, action, torch.ones(len(z))
+
+
+__all__ = [
+    "FineTune",
+    "FitDynamics",
+    "FitSets",
+    "Gather",
+    "SteerPolicy",
+    "TeachPolicy",
+    "action_grid",
+    "synthesis_phases",
+]
