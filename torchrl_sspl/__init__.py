@@ -25,7 +25,10 @@ if "SSPL/QuadrupedObstacle-v0" not in gymnasium.registry:
         max_episode_steps=80,
     )
 
-_SUBPACKAGES = ("certification", "data", "envs", "errors", "functional", "lipschitz", "modules", "objectives", "sets", "trainers", "viz")
+_SUBPACKAGES = (
+    "certification", "configs", "data", "envs", "errors", "evaluation", "experiments", "functional", "lipschitz", "modules",
+    "objectives", "sets", "trainers", "viability", "viz",
+)  # fmt: skip
 _NAMES = {
     "Agent": "modules.agent",
     "load": "modules.agent",
@@ -38,12 +41,13 @@ _NAMES = {
     "LipschitzLoss": "objectives",
     "TargetLoss": "objectives",
     "ActionValueLoss": "objectives",
-    "SSPLTrainer": "trainers.torchrl_trainer",
-    "run_experiment": "trainers.experiment",
-    "viability_kernel": "certification.ground_truth",
-    "recoverable_set": "certification.ground_truth",
-    "evaluate": "trainers.evaluation",
-    "certify": "trainers.certify",
+    "ConsistencyLoss": "objectives",
+    "SSPLTrainer": "trainers",
+    "run_experiment": "experiments.run",
+    "viability_kernel": "viability",
+    "recoverable_set": "viability",
+    "evaluate": "evaluation.known",
+    "certify": "evaluation.certify",
     "Certificate": "certification.certificate",
 }
 

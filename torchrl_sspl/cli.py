@@ -1,10 +1,10 @@
-"""The command ``sspl``: train, evaluate, verify."""
+"""The command ``sspl``: train, evaluate, verify, compare."""
 
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,20 +12,30 @@ from typing import Any
 
 from torchrl_sspl.errors import CheckpointError, ConfigError, SSPLError
 
-TRAIN = """sspl train [group=choice ...] [key=value ...]
+TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
 
 Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Started again with
 the same out_dir it continues where it was interrupted.
 
-  trainer=sspl            SSPLTrainer: any environment, collectors in other processes or on Ray (the default)
-  trainer=rounds          two time scales, in rounds, for systems whose dynamics are known; what the shipped agent is from
-  trainer=rounds_paper    the paper's losses and schedule as printed
+  env={envs}, or a .yaml file of your own, or env._target_=package.module:Env
+  preset={presets}
+  -m, --multirun    every combination of values that are separated by commas, each in a process of its own
+  --launcher ray    on a Ray cluster; --jobs N: runs at a time
+  --cfg job         print the configuration, train nothing
 
 Examples:
-  sspl train env=pendulum trainer.total_frames=64000
-  sspl train env=pendulum trainer=rounds out_dir=runs/pendulum
+  sspl train env=pendulum
+  sspl train env=quadruped preset=smoke out_dir=runs/try
   sspl train env=gymnasium env.make=my_system:make env.safe=my_system:safe env.unsafe=my_system:unsafe
+  sspl train --multirun env=pendulum seed=0,1,2 synthesis.margin=.05,.1
+
+key, meaning (type, value):
 """
+_INSTEAD = {
+    "--config-name": "env=NAME or env=FILE.yaml", "-cn": "env=NAME or env=FILE.yaml", "--config-path": "env=FILE.yaml",
+    "-cp": "env=FILE.yaml", "--config-dir": "env=FILE.yaml", "-cd": "env=FILE.yaml", "--resolve": "--cfg job",
+    "--package": "--cfg job", "--info": "--cfg job", "-c": "--cfg job", "-j": "--jobs N", "--resume": "the same out_dir",
+}  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -35,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         arguments: words after ``sspl``; by default those of the command line.
 
     Returns:
-        0; 1 if a verification fails; 2 for a wrong argument, with the reason on standard error.
+        0; 1 if a verification or a run of several fails; 2 for a wrong argument, with the reason on standard error.
 
     Source: none.
 
@@ -45,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    commands = {"train": train, "evaluate": evaluate, "verify": verify}
+    commands = {"train": train, "evaluate": evaluate, "verify": verify, "compare": compare}
     if words[:1] == ["--version"]:
         from torchrl_sspl import __version__
 
@@ -69,77 +79,99 @@ def _usage() -> str:
         "sspl COMMAND ...\n\n"
         "  train     train an agent, evaluate it and write its report; `sspl train --help` lists every field\n"
         "  evaluate  measure an agent again, on fresh data\n"
-        "  verify    check the certificates of an agent again"
+        "  verify    check the certificates of an agent again\n"
+        "  compare   a page with several runs beside each other"
     )
 
 
 def train(words: list[str]) -> int:
-    """``sspl train``: compose a configuration, train, evaluate and report.
+    """``sspl train``: compose a configuration, train, evaluate and report; or many of them.
 
     Args:
-        words: overrides, or ``--help``.
+        words: ``key=value`` and options, or ``--help``.
 
     Returns:
-        0.
+        0, or 1 where one of several runs failed.
 
     Raises:
-        ConfigError: if a key or a value is not valid.
-        MissingDependencyError: if Hydra is not installed.
+        ConfigError: if an option, a key or a value is not valid; before anything is computed.
 
     Source: paper, Algorithm 1.
     """
-    from torchrl_sspl.trainers import hydra_store
-
-    if any(word in ("-h", "--help") for word in words):
-        print(TRAIN + "\n" + hydra_store.help_text(words))
+    overrides, options = _options(words)
+    if options.keys() & {"--launcher", "--jobs"} and "--multirun" not in options:
+        raise ConfigError("expected --multirun with --launcher or --jobs, received none; one run needs neither")
+    if "--help" in options:
+        print(_help(overrides))
         return 0
-    config = hydra_store.compose(words)
-    from torchrl_sspl.trainers.config import TrainingConfig
+    if "--multirun" in options:
+        return _multirun(overrides, options)
+    from torchrl_sspl.configs.reader import EnvFactory, compose
 
-    if isinstance(config.trainer, TrainingConfig):
-        return _train_rounds(config)
-    from torchrl_sspl.trainers.experiment import Experiment
+    config = compose(overrides)
+    if "--cfg" in options:
+        from omegaconf import OmegaConf
 
-    outcome = Experiment(config, title=f"{type(config.env).__name__.removesuffix('EnvConfig')} from pixels").run()
+        print(OmegaConf.to_yaml(OmegaConf.create(config.to_dict())), end="")
+        return 0
+    EnvFactory(config.env)  # a system that is not there is named before anything is built
+    from torchrl_sspl.experiments.run import Experiment
+
+    outcome = Experiment(config).run()
     print(outcome.summary())
     print(f"report: {outcome.report}")
     return 0
 
 
-def _train_rounds(config: Any) -> int:
-    from torchrl_sspl.envs.base import SafetyEnv
-    from torchrl_sspl.trainers.experiment_config import EnvFactory
-    from torchrl_sspl.trainers.loggers import close_logger, make_logger
-    from torchrl_sspl.trainers.requirements import PENDULUM
-    from torchrl_sspl.trainers.run import run
+def _options(words: Sequence[str]) -> tuple[list[str], dict[str, str]]:
+    """Overrides, and options with their values."""
+    short = {"-m": "--multirun", "-h": "--help"}
+    overrides, options, rest = [], {}, list(words)
+    while rest:
+        word = rest.pop(0)
+        name, sign, value = word.partition("=")
+        name = short.get(name, name)
+        if name in ("--multirun", "--help") and not sign:
+            options[name] = ""
+        elif name in ("--launcher", "--jobs", "--cfg"):
+            if not sign and (not rest or rest[0].startswith("-")):
+                raise ConfigError(f"expected a value after {name}, received none; `sspl train --help` shows them")
+            options[name] = value if sign else rest.pop(0)
+        elif word.startswith("-"):
+            key = _INSTEAD.get(name) or f"{name.lstrip('-').replace('-', '_')}={value or (rest or ['VALUE'])[0]}"
+            raise ConfigError(
+                f"expected key=value, --multirun, --launcher, --jobs, --cfg job or --help, received '{word}'; use {key}"
+            )
+        else:
+            overrides.append(word)
+    if options.get("--cfg", "job") != "job":
+        raise ConfigError(f"expected --cfg job, received --cfg {options['--cfg']}; there is no other configuration than the job's")
+    return overrides, options
 
-    factory = EnvFactory(config.env)
 
-    def make(batch_size: list[int], seed: int) -> Any:
-        return factory(batch_size=batch_size, seed=seed)
+def _help(overrides: Sequence[str]) -> str:
+    from torchrl_sspl.configs.reader import ENVS, compose, fields
+    from torchrl_sspl.configs.schema import PRESETS
 
-    env = make([1], 0)
-    if not isinstance(env, SafetyEnv):
-        raise ConfigError(
-            f"expected an environment whose dynamics are known with trainer=rounds, received {type(env).__name__}; "
-            "choose trainer=sspl"
-        )
-    own: dict[str, Any] = {}
-    if type(env).__name__ == "PendulumEnv":
-        own = {
-            "requirements": PENDULUM,
-            "axes": ("angle [rad]", "angular velocity [rad/s]"),
-            "action": "torque [N m]",
-            "foreign": lambda env: lambda state: env.observe_gymnasium(state)[:, 3:],
-        }
-    logger = make_logger(
-        config.logger.kind, config.logger.kind, config.trainer.out_dir, project=getattr(config.logger, "project", "torchrl-sspl")
-    )
-    outcome = run(config.trainer, make, title=f"{type(env).__name__} from pixels", logger=logger, **own)
-    close_logger(logger)
-    print(outcome.summary() if own else f"training: {outcome.training.stop_reason}")
-    print(f"report: {outcome.report}")
-    return 0
+    rows = list(fields(compose(overrides)))
+    width = max(len(key) for key, *_ in rows) + 2
+    lines = [f"  {key:<{width}} {meaning} ({kind}, {'null' if value is None else value})" for key, kind, value, meaning in rows]
+    return TRAIN.format(envs="|".join(ENVS), presets="|".join(PRESETS)) + "\n".join(lines)
+
+
+def _multirun(overrides: Sequence[str], options: dict[str, str]) -> int:
+    from torchrl_sspl.experiments import sweep
+
+    jobs = options.get("--jobs")
+    if jobs is not None and not jobs.isdigit():
+        raise ConfigError(f"expected --jobs to be an integer >= 1, received '{jobs}'")
+    if "--cfg" in options:
+        for task in sweep.plan(overrides)[1]:
+            print(f"sspl train {' '.join(task.words)}")
+        return 0
+    out = sweep.sweep(overrides, launcher=options.get("--launcher", "local"), jobs=None if jobs is None else int(jobs))
+    print(out.summary())
+    return out.exit_code
 
 
 def evaluate(words: list[str]) -> int:
@@ -157,7 +189,7 @@ def evaluate(words: list[str]) -> int:
 
     Source: none.
     """
-    parser = argparse.ArgumentParser(prog="sspl evaluate", description="Measure an agent on fresh data.")
+    parser = argparse.ArgumentParser(prog="sspl evaluate", description="Measure an agent on fresh data.", allow_abbrev=False)
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="fields of the evaluation, such as seed=7")
     parser.add_argument("--json", metavar="FILE", help="write the measurements there too")
@@ -179,8 +211,7 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
 
     Args:
         name_or_path: as for ``torchrl_sspl.load``.
-        overrides: ``key=value`` for the fields of the evaluation: ``EvaluationConfig`` for agents of the rounds,
-            ``EpisodesConfig`` for those of ``SSPLTrainer``.
+        overrides: ``key=value`` for the fields of ``EvaluationConfig``.
         device: device of the networks.
 
     Returns:
@@ -192,65 +223,44 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
 
     Source: none.
     """
-    from torchrl_sspl.modules.agent import DESCRIPTION_FILE, ENCODERS, agent_directory, load
-    from torchrl_sspl.trainers.config import EvaluationConfig, _assign
-    from torchrl_sspl.trainers.experiment_config import EnvFactory, EpisodesConfig, resolve
+    from torchrl_sspl.configs.reader import EnvFactory, change, from_dict
+    from torchrl_sspl.envs.base import SafetyEnv
+    from torchrl_sspl.evaluation.episodes import evaluate_episodes
+    from torchrl_sspl.evaluation.known import evaluate as evaluate_known
+    from torchrl_sspl.modules.agent import load
 
-    directory = agent_directory(name_or_path)
-    try:
-        body = json.loads((directory / DESCRIPTION_FILE).read_text())
-    except json.JSONDecodeError as error:
-        raise CheckpointError(f"expected a readable {DESCRIPTION_FILE} in '{directory}', received {error}") from error
-    experiment = body.get("experiment")
-    own_encoder = ((experiment or {}).get("network") or {}).get("encoder")
-    if own_encoder:
-        ENCODERS[body["networks"]["encoder"]["class"]] = resolve(own_encoder)
-    agent = load(directory, device)
-    values: dict[str, str] = {}
-    for item in overrides:
-        key, sign, value = item.partition("=")
-        if not sign:
-            raise ConfigError(f"expected an argument of the form key=value, received '{item}'; e.g. seed=7")
-        values[key] = value
-    config: Any = EpisodesConfig(**experiment["evaluation"]) if experiment else EvaluationConfig()
-    if not experiment and body.get("training", {}).get("evaluation"):
-        known = {f.name for f in dataclasses.fields(EvaluationConfig)}  # another version may have had others
-        config = EvaluationConfig(**{k: v for k, v in body["training"]["evaluation"].items() if k in known})
-    for key, value in values.items():
-        _assign(config, key, value)
-    if experiment:
-        from torchrl_sspl.trainers.episodes import evaluate_episodes
-
-        if "_target_" not in (experiment.get("env") or {}):
-            raise CheckpointError(
-                f"expected the agent in '{directory}' to name its environment, found none: it was given in code; call "
-                "evaluate_episodes(agent, make_env) there"
-            )
-        return evaluate_episodes(agent, EnvFactory(experiment["env"]), config)
-    from torchrl_sspl.envs import DubinsEnv, PendulumEnv
-    from torchrl_sspl.trainers.evaluation import evaluate as measure
-    from torchrl_sspl.trainers.quadruped import evaluate_dubins
-
-    measures = {"PendulumEnv": (PendulumEnv, measure), "DubinsEnv": (DubinsEnv, evaluate_dubins)}
-    named = body.get("environment", "PendulumEnv")
-    if named not in measures:
+    agent = load(name_or_path, device)
+    trained = agent.description.get("config", {})
+    if "env" in trained and "_target_" not in trained["env"]:
         raise CheckpointError(
-            f"expected the agent in '{directory}' to be trained on one of {', '.join(measures)}, found '{named}'; "
-            "call evaluate(agent, env) in your own code"
+            f"expected the agent '{name_or_path}' to name its environment, found none: it was given in code; call "
+            "evaluate_episodes(agent, make_env) there"
         )
-    make, judge = measures[named]
-    env = make(batch_size=[1], seed=config.seed)
-    return judge(agent, env, config, progress=sys.stderr.isatty())
+    try:
+        config = from_dict(agent.description["config"])
+    except (KeyError, ConfigError) as error:
+        raise CheckpointError(
+            f"expected the agent '{name_or_path}' to hold the configuration of its training, received {type(error).__name__}: "
+            f"{error}; it was made by another version of the library, or by code: call evaluate(agent, env, config) there"
+        ) from error
+    config = change(config, [w if w.startswith("evaluation.") else f"evaluation.{w}" for w in overrides])
+    make_env = EnvFactory(config.env)
+    env = make_env(batch_size=[1], seed=config.evaluation.seed)
+    if isinstance(env, SafetyEnv):
+        return evaluate_known(agent, env.known_twin(), config.evaluation, progress=sys.stderr.isatty())
+    env.close()
+    return evaluate_episodes(agent, make_env, config.evaluation)
 
 
 def verify(words: list[str]) -> int:
     """``sspl verify``: check the certificates of an agent again.
 
     Args:
-        words: name of a shipped agent or a run directory.
+        words: name of a shipped agent or a run directory, and options.
 
     Returns:
-        0 if everything that is claimed holds, else 1.
+        0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no certificate or the file is
+        none, 4 if the agent cannot be read, 5 if the time was too short.
 
     Raises:
         CheckpointError: if there is no such agent.
@@ -259,10 +269,41 @@ def verify(words: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="sspl verify", description="Check the certificates of an agent again.")
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
+    text = "measure all episodes again, on the system that the agent names; runs its code, whoever wrote it"
+    parser.add_argument("--measure", action="store_true", help=text)
+    parser.add_argument("--seconds", type=float, default=60.0, help="time for everything, without --measure (default: 60)")
     options = parser.parse_args(words)
-    from torchrl_sspl.trainers.certify import verify_run
+    from torchrl_sspl.evaluation.certify import verify_run
 
-    return int(verify_run(options.agent))
+    return int(verify_run(options.agent, measure=options.measure or None, seconds=options.seconds))
+
+
+def compare(words: list[str]) -> int:
+    """``sspl compare``: write a page that shows runs beside each other, and print their table.
+
+    Args:
+        words: directories of runs.
+
+    Returns:
+        0.
+
+    Raises:
+        CheckpointError: if none of them is a run that has come to an end.
+
+    Source: none.
+    """
+    parser = argparse.ArgumentParser(prog="sspl compare", description="Runs beside each other, on one page.")
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="directories of runs; other files are passed over")
+    parser.add_argument("--out", metavar="FILE", help="the page; default: comparison.html beside the runs")
+    options = parser.parse_args(words)
+    from torchrl_sspl.viz import compare as page
+
+    runs = page.read_runs([run for run in options.runs if not Path(run).is_file()])
+    beside = os.path.commonpath([str(run.directory.resolve().parent) for run in runs] or ["."])
+    path = page.compare(runs, options.out or Path(beside) / "comparison.html")
+    print(page.text_table(page.rows_of(runs)))
+    print(f"comparison: {path}")
+    return 0
 
 
 if __name__ == "__main__":

@@ -9,25 +9,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.modules.agent import Agent, hosted
 from torchrl_sspl.viz.plane import BARRIER_COLOUR, PATH_COLOURS, Plane, array, new_figure, require, zero_level
 
 _WIDTH, _HEIGHT, _DPI = 9.6, 5.4, 80  # 768 x 432 pixels: even, as the video codec wants them
 
 
-@torch.no_grad()
 def animate(
-    agent: Any,
-    env: Any,
-    start: Tensor,
-    steps: int,
+    states: Any,
+    frames: Any,
+    barrier: Any,
+    actions: Any,
     path: str | Path,
     *,
-    plane: Plane | None = None,
+    plane: Plane,
     background: tuple[Any, Any] | None = None,
     action_name: str = "action",
     fps: int = 20,
@@ -36,12 +32,12 @@ def animate(
     """Film of one closed-loop episode: the frame seen, the path in the state plane, the barrier value below.
 
     Args:
-        agent: has ``act(pixels (1, 6, H, W)) -> action (1, m), barrier (1, 1)``.
-        env: has ``observe``, ``dynamics``, ``wrap``; and the regions, if no plane is given.
-        start: ``(state_dim,)`` or ``(1, state_dim)`` first state.
-        steps: number of steps.
+        states: ``(T + 1, dim)`` true states.
+        frames: ``(T + 1, 3, H, W)`` uint8 what was seen of them.
+        barrier: ``(T + 1,)`` barrier values; None: the action is shown below instead.
+        actions: ``(T, m)``, T >= 1; the first component is shown.
         path: the file to write, ``.mp4`` or ``.gif``.
-        plane: the coordinates shown; default: the first two of the environment's state.
+        plane: the coordinates shown.
         background: grid states ``(k, dim)`` and their barrier values ``(k,)``, of which the zero level is drawn.
         action_name: name and unit of the action.
         fps: pictures per second.
@@ -51,59 +47,46 @@ def animate(
         The file written. Without ``imageio-ffmpeg`` a film that was to be an mp4 becomes a gif, with a warning.
 
     Raises:
-        ShapeError, ConfigError: the start, the number of steps or the file name is not what was expected.
+        ShapeError, NonFiniteError, ConfigError: an argument or the file name is not what was expected.
         MissingDependencyError: matplotlib is not installed.
 
-    Source: paper Section V, figure "sspl_pend"; deviation: it moves.
+    Source: paper Section V, figures "sspl_pend" and "traj_sspl_gr"; deviation: they move, and B is shown.
+
+    Example:
+        >>> import tempfile
+        >>> plane, pictures = Plane(("x", "v"), [-1, -1], [1, 1]), torch.zeros(3, 3, 8, 8, dtype=torch.uint8)
+        >>> film = tempfile.mkdtemp() + "/film.gif"
+        >>> animate(torch.zeros(3, 2), pictures, torch.zeros(3), torch.zeros(2, 1), film, plane=plane).name
+        'film.gif'
     """
     path = Path(path)
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"path: expected a file name that ends in .mp4 or .gif, received '{path.name}'.")
-    if not isinstance(steps, int) or steps < 1:
-        raise ConfigError(f"steps: expected an integer >= 1, received {steps!r}.")
-    plane = plane or Plane.of(env)
-    first = torch.as_tensor(start, dtype=torch.float32)
-    if first.shape == (1, plane.dim):
-        first = first[0]
-    if first.shape != (plane.dim,):
-        raise ShapeError(f"start: expected shape ({plane.dim},), received {tuple(first.shape)}.")
-    array("start", first, (plane.dim,))
+    x, u = array("states", states, (None, plane.dim)), array("actions", actions, (None, None))
+    if len(u) < 1 or len(x) != len(u) + 1:
+        raise ShapeError(f"states and actions: expected T + 1 and T >= 1 rows, received {len(x)} and {len(u)}.")
+    pictures = array("frames", frames, (len(x), 3, None, None)).astype(np.uint8).transpose(0, 2, 3, 1)
+    values = None if barrier is None else array("barrier", barrier, (len(x),))
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         warnings.warn("imageio-ffmpeg is not installed; the film becomes a gif.", stacklevel=2)
         path = path.with_suffix(".gif")
-
-    agent = hosted(agent) if isinstance(agent, Agent) else agent
-    state, previous = env.wrap(first[None]), None
-    states, pictures, values, actions = [], [], [], []
-    for _ in range(steps + 1):
-        pixels = env.observe(state, previous)
-        action, barrier = agent.act(pixels)
-        states.append(state[0].cpu().numpy())
-        pictures.append(pixels[0, 3:].permute(1, 2, 0).cpu().numpy())
-        values.append(float(barrier))
-        actions.append(action[0].cpu().numpy())
-        previous, state = state, env.wrap(env.dynamics(state, action))
-    episode = (
-        np.stack(states)[:, list(plane.coords)],
-        np.stack(pictures),
-        np.array(values),
-        np.stack(actions)[:, 0],
-    )
-    images = _images(episode, plane, background, action_name, title)
+    shown = np.append(u[:, 0], u[-1, 0])  # of the last state no action was asked
+    images = _images((x[:, list(plane.coords)], pictures, values, shown), plane, background, action_name, title)
     path.parent.mkdir(parents=True, exist_ok=True)
     (_write_mp4 if path.suffix == ".mp4" else _write_gif)(path, images, fps)
     return path
 
 
 def _images(
-    episode: tuple[np.ndarray, ...],
+    episode: tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray],
     plane: Plane,
     background: tuple[Any, Any] | None,
     action_name: str,
     title: str,
 ) -> Iterator[np.ndarray]:
     """RGB pictures of the film; what does not move is drawn once."""
-    points, pictures, values, actions = episode
+    points, pictures, barrier, actions = episode
+    values = actions if barrier is None else barrier
     figure = new_figure(_WIDTH, _HEIGHT)
     figure.set_dpi(_DPI)
     grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.35), height_ratios=(2.4, 1))
@@ -119,9 +102,11 @@ def _images(
     low, high = min(values.min(), 0.0), max(values.max(), 0.0)
     room = 0.08 * (high - low) + 1e-3
     steps = np.arange(len(values))
-    below.axhspan(low - room, 0, color="#cdeccd", linewidth=0)
+    if barrier is not None:
+        below.axhspan(low - room, 0, color="#cdeccd", linewidth=0)
     below.axhline(0, color=BARRIER_COLOUR, linewidth=1.0)
-    below.set(xlim=(0, max(1, len(values) - 1)), ylim=(low - room, high + room), ylabel="B(z)", xlabel="step")
+    below.set(xlim=(0, max(1, len(values) - 1)), ylim=(low - room, high + room), xlabel="step")
+    below.set_ylabel("B(z)" if barrier is not None else action_name)
 
     image = seen.imshow(pictures[0], interpolation="nearest", animated=True)
     (track,) = where.plot([], [], color=PATH_COLOURS[0], linewidth=1.6, animated=True)
@@ -139,7 +124,8 @@ def _images(
         dot.set_data(points[t, :1], points[t, 1:])
         curve.set_data(steps[: t + 1], values[: t + 1])
         now.set_data(steps[t : t + 1], values[t : t + 1])
-        text.set_text(f"B = {values[t]:+.3f}   {action_name}: {actions[t]:+.2f}")
+        said = "" if barrier is None else f"B = {values[t]:+.3f}   "
+        text.set_text(f"{said}{action_name}: {actions[t]:+.2f}")
         for axes, artists in ((seen, (image,)), (where, (track, dot)), (below, (curve, now, text))):
             for artist in artists:
                 axes.draw_artist(artist)

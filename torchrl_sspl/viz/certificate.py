@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from html import escape
 
-from torchrl_sspl.certification.certificate import ASSUMED, PROVED, Certificate, Statement
-from torchrl_sspl.viz.report import badge, format_value, table
+from torchrl_sspl.certification.certificate import PROVED, Certificate, Statement
+from torchrl_sspl.certification.rounding import missed, shown
+from torchrl_sspl.viz.report import badge, table
 
 _TITLES = {
     "deterministic": "What the weights prove",
@@ -67,21 +68,19 @@ def proved_lines(certificate: Certificate) -> list[str]:
     for layer in certificate.layers.values():
         for s in layer.statements:
             if s.kind == PROVED and s.holds:
-                value = "" if s.value is None or not s.unit else f" ({format_value(s.value, s.unit)})"
+                value = "" if s.value is None or not s.unit else f" ({shown(s)})"
                 lines.append(s.text + value + ".")
     return lines
 
 
 def _row(statement: Statement) -> list[str]:
     s = statement
-    if s.kind == ASSUMED:
-        status = "assumed" if s.value is None else "reported"
+    if not s.decides:
+        status = s.kind
     elif s.holds:
         status = badge("proved" if s.kind == PROVED else "yes")
     else:
-        miss = "" if s.misses_by is None else f", misses by {format_value(s.misses_by, s.unit)}"
+        miss = "" if s.misses_by is None else f", misses by {missed(s)}"
         status = badge(f"not {s.kind}{miss}" if s.kind == PROVED else f"does not hold{miss}")
-    value = "" if s.value is None else format_value(s.value, s.unit)
     size = "" if s.n is None else f"{s.n:,}" + ("" if s.confidence is None else f", {100 * s.confidence:g} %")
-    where = f" ({s.name.removeprefix('error ')})" if s.name.startswith("error ") else ""  # their texts are the same
-    return [escape(s.text + where), status, escape(value), escape(size), escape(s.detail)]
+    return [escape(s.text), status, escape(shown(s)), escape(size), escape(s.detail)]

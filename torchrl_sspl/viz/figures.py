@@ -26,6 +26,7 @@ from torchrl_sspl.viz.plane import (
 )
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 __all__ = ["frames", "latent_space", "state_plane", "training_curves", "trajectories"]
@@ -114,53 +115,69 @@ def latent_space(
     caption = "Latent points of S, U and the unlabelled buffer"
     style = dict(s=11, c=BARRIER_COLOUR, marker="o", linewidths=0, zorder=5, label=f"|B| \u2264 {near:g}")
     if p == 3:
-        require("mpl_toolkits.mplot3d")
         figure = new_figure(9.2, 4.6, f"{caption}, seen from two sides; black: the border of the learned safe set.")
-        for k, azimuth in enumerate((-60, 30)):
-            ax = figure.add_subplot(1, 2, k + 1, projection="3d")
-            ax.computed_zorder = False  # type: ignore[attr-defined]
-            _scatter(ax, z[rows], codes[rows], depthshade=False)
-            if len(border):
-                ax.scatter(*z[border].T, depthshade=False, **style)  # type: ignore[misc]
-            ax.set(xlabel="z\u2081", ylabel="z\u2082", zlabel="z\u2083")  # type: ignore[call-arg]
-            ax.view_init(elev=22, azim=azimuth)  # type: ignore[attr-defined]
-            ax.tick_params(labelsize=7, pad=-2)
-            for axis in (ax.xaxis, ax.yaxis, ax.zaxis):  # type: ignore[attr-defined]
-                axis.set_ticks([-1, 0, 1])
-                axis.labelpad = -6
-            ax.set_box_aspect(None, zoom=0.92)  # type: ignore[call-arg, arg-type]
+        _latent_3d(figure, z, codes, rows, border, style)
     elif p == 2:
         figure = new_figure(6, 5, f"{caption}; black line: B = 0.")
-        ax = figure.add_subplot()
-        if barrier is not None:
-            axis = np.linspace(-1, 1, 201)
-            nodes = np.stack(np.meshgrid(axis, axis), -1)
-            level = _evaluate(barrier, nodes.reshape(-1, 2)).reshape(201, 201)
-            top = np.abs(level).max() or 1.0
-            shade = ax.contourf(
-                axis, axis, level, levels=np.linspace(-top, top, 13), cmap="PuOr_r", alpha=0.35, zorder=0
-            )
-            figure.colorbar(shade, ax=ax, label="B(z)")
-            zero_level(ax, axis, axis, level, colors=BARRIER_COLOUR, linewidths=1.8)
-        _scatter(ax, z[rows], codes[rows], zorder=2)
-        ax.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), xlabel="z\u2081", ylabel="z\u2082", aspect="equal")
+        _latent_2d(figure, z, codes, rows, barrier)
     else:
         figure = new_figure(6, 5, f"{caption} in the first two principal components; black: near the barrier's zero.")
-        centred = z - z.mean(0)
-        _, size, direction = np.linalg.svd(centred, full_matrices=False)
-        share = size**2 / max(float((size**2).sum()), 1e-30)
-        flat = centred @ direction[:2].T
-        ax = figure.add_subplot()
-        _scatter(ax, flat[rows], codes[rows])
-        if len(border):
-            ax.scatter(*flat[border].T, **style)  # type: ignore[arg-type]
-        ax.set(xlabel=f"component 1 ({share[0]:.0%} of variance)", ylabel=f"component 2 ({share[1]:.0%})")
+        _latent_components(figure, z, codes, rows, border, style)
     handles, labels = figure.axes[0].get_legend_handles_labels()
     if p == 2 and barrier is not None:
         handles.append(_line(BARRIER_COLOUR, "B = 0"))
         labels.append("B = 0")
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, markerscale=1.8)
     return figure
+
+
+def _latent_3d(
+    figure: Figure, z: np.ndarray, codes: np.ndarray, rows: np.ndarray, border: np.ndarray, style: dict[str, Any]
+) -> None:
+    require("mpl_toolkits.mplot3d")
+    for k, azimuth in enumerate((-60, 30)):
+        ax = figure.add_subplot(1, 2, k + 1, projection="3d")
+        ax.computed_zorder = False  # type: ignore[attr-defined]
+        _scatter(ax, z[rows], codes[rows], depthshade=False)
+        if len(border):
+            ax.scatter(*z[border].T, depthshade=False, **style)  # type: ignore[misc]
+        ax.set(xlabel="z\u2081", ylabel="z\u2082", zlabel="z\u2083")  # type: ignore[call-arg]
+        ax.view_init(elev=22, azim=azimuth)  # type: ignore[attr-defined]
+        ax.tick_params(labelsize=7, pad=-2)
+        for axis in (ax.xaxis, ax.yaxis, ax.zaxis):  # type: ignore[attr-defined]
+            axis.set_ticks([-1, 0, 1])
+            axis.labelpad = -6
+        ax.set_box_aspect(None, zoom=0.92)  # type: ignore[call-arg, arg-type]
+
+
+def _latent_2d(
+    figure: Figure, z: np.ndarray, codes: np.ndarray, rows: np.ndarray, barrier: Callable[[Tensor], Tensor] | None
+) -> None:
+    ax = figure.add_subplot()
+    if barrier is not None:
+        axis = np.linspace(-1, 1, 201)
+        nodes = np.stack(np.meshgrid(axis, axis), -1)
+        level = _evaluate(barrier, nodes.reshape(-1, 2)).reshape(201, 201)
+        top = np.abs(level).max() or 1.0
+        shade = ax.contourf(axis, axis, level, levels=np.linspace(-top, top, 13), cmap="PuOr_r", alpha=0.35, zorder=0)
+        figure.colorbar(shade, ax=ax, label="B(z)")
+        zero_level(ax, axis, axis, level, colors=BARRIER_COLOUR, linewidths=1.8)
+    _scatter(ax, z[rows], codes[rows], zorder=2)
+    ax.set(xlim=(-1.02, 1.02), ylim=(-1.02, 1.02), xlabel="z\u2081", ylabel="z\u2082", aspect="equal")
+
+
+def _latent_components(
+    figure: Figure, z: np.ndarray, codes: np.ndarray, rows: np.ndarray, border: np.ndarray, style: dict[str, Any]
+) -> None:
+    centred = z - z.mean(0)
+    _, size, direction = np.linalg.svd(centred, full_matrices=False)
+    share = size**2 / max(float((size**2).sum()), 1e-30)
+    flat = centred @ direction[:2].T
+    ax = figure.add_subplot()
+    _scatter(ax, flat[rows], codes[rows])
+    if len(border):
+        ax.scatter(*flat[border].T, **style)
+    ax.set(xlabel=f"component 1 ({share[0]:.0%} of variance)", ylabel=f"component 2 ({share[1]:.0%})")
 
 
 def _evaluate(barrier: Callable[[Tensor], Tensor], latent: np.ndarray) -> np.ndarray:
@@ -318,68 +335,72 @@ def trajectories(
     )
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
     ax = figure.add_subplot(grid[:, 0])
-    shown = x[:, chosen][..., list(plane.coords)].reshape(-1, 2)
-    plane.draw(ax, cover=shown)
-    handles = plane.set_handles()
-    limits = [(plane.low[k] - 1e-4, plane.high[k] + 1e-4) for k in plane.coords]
-    if any(shown[:, k].min() < low or shown[:, k].max() > high for k, (low, high) in enumerate(limits)):
-        patch = require("matplotlib.patches").Patch
-        handles.append(patch(facecolor=OUTSIDE_FILL, edgecolor="#9a9a9a", linewidth=0.5, label="beyond the space"))
-    if background is not None:
-        gx, gy, table = plane.grid(background[0], {"barrier": background[1]})
-        if zero_level(ax, gx, gy, table["barrier"], colors=BARRIER_COLOUR, linewidths=1.8, zorder=2):
-            handles.append(_line(BARRIER_COLOUR, "B = 0"))
-    marker = require("matplotlib.lines").Line2D
-    for colour, k in zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True):
+    handles = _draw_sets(ax, plane, x[:, chosen][..., list(plane.coords)].reshape(-1, 2), background)
+    colours = list(zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True))
+    for colour, k in colours:
         path = x[: last[k] + 1, k][:, list(plane.coords)]
-        ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.2, zorder=3)
-        ax.plot(*path[0], "o", color=colour, markersize=5, markeredgecolor="white", zorder=5)
-        at = _spaced(path / extent, arrows)
-        along = _directions(path / extent, action_direction)
-        length = (
-            0.13
-            * extent
-            * along
-            * (u[: last[k], k] if action_direction is not None else np.abs(u[: last[k], k]))[:, None]
-            / largest
-        )
-        ax.quiver(
-            *path[at].T,
-            *length[at].T,
-            angles="xy",
-            scale_units="xy",
-            scale=1,
-            width=0.005,
-            headwidth=4,
-            headlength=4.5,
-            headaxislength=4,
-            minlength=0.3,
-            color=colour,
-            zorder=4,
-            alpha=0.9,
-        )
+        _draw_path(ax, plane, path, u[: last[k], k] / largest, extent, colour, action_direction, arrows)
+    marker = require("matplotlib.lines").Line2D
     handles.append(marker([], [], marker="o", color="#555555", linewidth=1.2, label="start and path"))
     arrow = "$\\uparrow$" if action_direction is not None else "$\\rightarrow$"
     handles.append(
         marker([], [], marker=arrow, color="#555555", linestyle="", markersize=9, label=f"{action_name}, size")
     )
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
+    _draw_over_time(figure, grid, values, u, last, colours, dt, action_name)
+    return figure
 
-    time = np.arange(steps + 1) * (dt or 1.0)
-    colours = list(zip(np.resize(PATH_COLOURS, len(chosen)), chosen, strict=True))
+
+def _draw_sets(ax: Axes, plane: Plane, cover: np.ndarray, background: tuple[Any, Any] | None) -> list[Any]:
+    """The plane with its sets, what lies beyond it and the line B = 0, as far as points reach; legend entries."""
+    plane.draw(ax, cover=cover)
+    handles = plane.set_handles()
+    limits = [(plane.low[k] - 1e-4, plane.high[k] + 1e-4) for k in plane.coords]
+    if any(cover[:, k].min() < low or cover[:, k].max() > high for k, (low, high) in enumerate(limits)):
+        patch = require("matplotlib.patches").Patch
+        handles.append(patch(facecolor=OUTSIDE_FILL, edgecolor="#9a9a9a", linewidth=0.5, label="beyond the space"))
+    if background is not None:
+        gx, gy, table = plane.grid(background[0], {"barrier": background[1]})
+        if zero_level(ax, gx, gy, table["barrier"], colors=BARRIER_COLOUR, linewidths=1.8, zorder=2):
+            handles.append(_line(BARRIER_COLOUR, "B = 0"))
+    return handles
+
+
+def _draw_path(
+    ax: Axes, plane: Plane, path: np.ndarray, action: np.ndarray, extent: np.ndarray, colour: str,
+    direction: tuple[float, float] | None, arrows: int,
+) -> None:  # fmt: skip
+    """One path with its start, and its actions (as shares of the largest) as arrows."""
+    ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.2, zorder=3)
+    ax.plot(*path[0], "o", color=colour, markersize=5, markeredgecolor="white", zorder=5)
+    at = _spaced(path / extent, arrows)
+    size = action if direction is not None else np.abs(action)
+    length = 0.13 * extent * _directions(path / extent, direction) * size[:, None]
+    ax.quiver(
+        *path[at].T, *length[at].T, angles="xy", scale_units="xy", scale=1, width=0.005, headwidth=4, headlength=4.5,
+        headaxislength=4, minlength=0.3, color=colour, zorder=4, alpha=0.9,
+    )  # fmt: skip
+
+
+def _draw_over_time(
+    figure: Figure, grid: Any, values: np.ndarray | None, u: np.ndarray, last: np.ndarray, colours: list[tuple[str, int]],
+    dt: float | None, action_name: str,
+) -> None:  # fmt: skip
+    """Barrier value, if there is one, and action of the chosen episodes over time."""
+    time = np.arange(len(u) + 1) * (dt or 1.0)
+    end = time[max(last[k] for _, k in colours)]
     if values is not None:
         upper = figure.add_subplot(grid[0, 1])
         for colour, k in colours:
             upper.plot(time[: last[k] + 1], values[: last[k] + 1, k], color=colour, linewidth=1.2)
         upper.axhline(0, color=BARRIER_COLOUR, linewidth=1.0, linestyle=":")
-        upper.set(ylabel="B(z)", xlim=(0, time[last[chosen].max()]))
+        upper.set(ylabel="B(z)", xlim=(0, end))
         upper.tick_params(labelbottom=False)
     lower = figure.add_subplot(grid[1 if values is not None else slice(None), 1])
     for colour, k in colours:
         lower.step(time[: last[k]], u[: last[k], k], where="post", color=colour, linewidth=0.8, alpha=0.85)
     lower.axhline(0, color="#999999", linewidth=0.8)
-    lower.set(ylabel=action_name, xlabel="time [s]" if dt else "step", xlim=(0, time[last[chosen].max()]))
-    return figure
+    lower.set(ylabel=action_name, xlabel="time [s]" if dt else "step", xlim=(0, end))
 
 
 def _spread(points: np.ndarray, count: int) -> np.ndarray:

@@ -370,76 +370,91 @@ def write_report(
     """
     data = {name: _plain(f"measurements[{name!r}]", m) for name, m in (measurements or {}).items()}
     config = dict(config or {})
-    title_line, kind, rows_of_summary = _summary(summary, data)
+    first, kind, rows_of_summary = _summary(summary, data)
     if not summary and headline is not None:
-        title_line, kind = headline
-    measured = _measured_lines(summary, data) or list(measured)
-    columns = [
-        ("Proved", list(proved) or ["Nothing is claimed as proved."]),
-        ("Measured", measured or ["No share with a confidence bound."]),
-        ("Assumed", list(_ASSUMED if assumed is None else assumed) or ["Nothing stated."]),
-    ]
-    facts = [f"seed {config['seed']}"] if "seed" in config else []
-    facts += [f"preset {config['preset']}"] if "preset" in config else []
-    facts += [
-        f"torchrl_sspl {_version('torchrl-sspl')}",
-        f"torch {_version('torch')}",
-        f"Python {platform.python_version()}",
-    ]
-
+        first, kind = headline
+    shown = _measured_lines(summary, data) or measured
     parts = [
-        f"<header><h1>{escape(title)}</h1><p class='facts'>{escape(' / '.join(facts))}</p></header>",
-        f'<section class="verdict {kind}"><h2>{_BADGES[kind]} {escape(title_line)}</h2><div class="columns">'
-        + "".join(f"<div><h3>{name}</h3>{_list(items)}</div>" for name, items in columns)
-        + "</div></section>",
+        f"<header><h1>{escape(title)}</h1><p class='facts'>{escape(' / '.join(_facts(config)))}</p></header>",
+        _verdict(first, kind, proved, shown, _ASSUMED if assumed is None else assumed),
+        _section("Requirements", rows_of_summary),
+        certificate or "",
+        _section("Notes", _paragraphs(notes)),
+        _section("Episode", "" if video is None else _film(video, video_caption)),
+        _section("Figures", "".join(_figure(n, f) for n, f in (figures or {}).items())),
+        _section("Held-out checks of every round", _sizes(checks) if checks else ""),
+        _measurements(data) if data else "",
+        _configuration(config) if config else "",
     ]
-    if rows_of_summary:
-        parts.append(f"<section><h2>Requirements</h2>{rows_of_summary}</section>")
-    if certificate:
-        parts.append(certificate)
-    if notes.strip():
-        paragraphs = (escape(p.strip()).replace("\n", "<br>") for p in re.split(r"\n\s*\n", notes.strip()))
-        parts.append("<section><h2>Notes</h2>" + "".join(f"<p>{p}</p>" for p in paragraphs) + "</section>")
-    if video is not None:
-        uri, mime = _file_uri(video)
-        text = escape(video_caption)
-        parts.append(
-            f"<section><h2>Episode</h2><figure>{_media(uri, mime, text)}<figcaption>{text}</figcaption></figure></section>"
-        )
-    if figures:
-        parts.append("<section><h2>Figures</h2>" + "".join(_figure(n, f) for n, f in figures.items()) + "</section>")
-    if checks:
-        parts.append(f"<section><h2>Held-out checks of every round</h2>{_sizes(checks)}</section>")
-    if data:
-        cells = [
-            [
-                f"<code>{escape(n)}</code>",
-                escape(format_value(m.get("value"), m.get("unit", ""))),
-                escape(_bound(m)),
-                escape(_count(m.get("n"))),
-                escape(str(m.get("note", ""))),
-            ]
-            for n, m in data.items()
-        ]
-        body = table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
-        parts.append(
-            f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>"
-        )
-    if config:
-        rows = [[f"<code>{escape(k)}</code>", escape(str(v))] for k, v in _flatten(config)]
-        body = table(("Key", "Value"), rows, kind="plain")
-        parts.append(f"<section><details><summary>Configuration</summary>{body}</details></section>")
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(_page(title, "".join(parts)), encoding="utf-8")
+    return path
 
-    page = (
+
+def _page(title: str, body: str) -> str:
+    return (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{CSS}</style></head><body><main>{''.join(parts)}</main></body></html>\n"
+        f"<title>{escape(title)}</title><style>{CSS}</style></head><body><main>{body}</main></body></html>\n"
     )
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(page, encoding="utf-8")
-    return path
+
+
+def _verdict(text: str, kind: str, proved: Sequence[str], measured: Sequence[str], assumed: Sequence[str]) -> str:
+    """The head of the page: the verdict, and lists of what is proved, measured and assumed."""
+    columns = (
+        ("Proved", proved or ["Nothing is claimed as proved."]),
+        ("Measured", measured or ["No share with a confidence bound."]),
+        ("Assumed", assumed or ["Nothing stated."]),
+    )
+    lists = "".join(f"<div><h3>{name}</h3>{_list(items)}</div>" for name, items in columns)
+    return (
+        f'<section class="verdict {kind}"><h2>{_BADGES[kind]} {escape(text)}</h2><div class="columns">{lists}</div></section>'
+    )
+
+
+def _facts(config: Mapping[str, Any]) -> list[str]:
+    """What the run was made with, for the line under the title."""
+    chosen = [f"{key} {config[key]}" for key in ("seed", "preset") if key in config]
+    versions = [f"torchrl_sspl {_version('torchrl-sspl')}", f"torch {_version('torch')}"]
+    return [*chosen, *versions, f"Python {platform.python_version()}"]
+
+
+def _section(title: str, body: str) -> str:
+    return f"<section><h2>{title}</h2>{body}</section>" if body else ""
+
+
+def _paragraphs(notes: str) -> str:
+    found = (p.strip() for p in re.split(r"\n\s*\n", notes))
+    return "".join(f"<p>{escape(p)}</p>".replace("\n", "<br>") for p in found if p)
+
+
+def _film(path: str | Path, caption: str) -> str:
+    uri, mime = _file_uri(path)
+    return f"<figure>{_media(uri, mime, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
+
+
+def _measurements(data: Mapping[str, dict[str, Any]]) -> str:
+    """Every measurement with its bound, size and how it was made."""
+    cells = [
+        [
+            f"<code>{escape(n)}</code>",
+            escape(format_value(m.get("value"), m.get("unit", ""))),
+            escape(_bound(m)),
+            escape(_count(m.get("n"))),
+            escape(str(m.get("note", ""))),
+        ]
+        for n, m in data.items()
+    ]
+    body = table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
+    return f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>"
+
+
+def _configuration(config: Mapping[str, Any]) -> str:
+    rows = [[f"<code>{escape(k)}</code>", escape(str(v))] for k, v in _flatten(config)]
+    body = table(("Key", "Value"), rows, kind="plain")
+    return f"<section><details><summary>Configuration</summary>{body}</details></section>"
 
 
 def _version(package: str) -> str:

@@ -20,7 +20,7 @@ section{background:var(--card);border:1px solid var(--line);border-radius:10px;p
 table{border-collapse:collapse;width:100%;font-size:.9rem;font-variant-numeric:tabular-nums}
 th,td{text-align:left;padding:.4em .6em;border-bottom:1px solid var(--line);vertical-align:top}
 th{color:var(--soft);font-weight:600;white-space:nowrap}tbody tr:last-child td{border-bottom:0}
-td{overflow-wrap:break-word}table.summary td:nth-child(n+2):nth-child(-n+6){white-space:nowrap}
+td{overflow-wrap:break-word}table.summary td:nth-child(n+2){white-space:nowrap}
 code{font-size:.88em;overflow-wrap:anywhere}
 .badge{display:inline-block;border-radius:6px;padding:.05em .5em;font-weight:600;background:var(--none-bg);color:var(--none)}
 .badge.good{background:var(--good-bg);color:var(--good)}.badge.fair{background:var(--fair-bg);color:var(--fair)}

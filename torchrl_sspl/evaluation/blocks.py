@@ -1,0 +1,394 @@
+"""Fresh episodes behind a certificate: of which system, block by block, and what is counted on them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torchrl.envs import EnvBase
+
+from torchrl_sspl.certification.conditions import closed_loop_lipschitz
+from torchrl_sspl.certification.record import NOTHING, RIMS, Counts, Record
+from torchrl_sspl.certification.statistics import fingerprint, largest_error_bound, paper_numbers
+from torchrl_sspl.configs.reader import EnvFactory, resolve
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import ConfigError, NonFiniteError, SSPLError
+from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, RandomController
+from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.functional import covering_radius
+from torchrl_sspl.modules.agent import Agent, hosted
+from torchrl_sspl.seeds import spawn
+from torchrl_sspl.sets import SAFE, UNSAFE
+
+_COVERED = 4000  # observations of which a covering radius is computed, from an environment's own resets
+_BARELY = (
+    1e-4  # of the barrier's range: another machine may round a decision that is closer than this to the other side
+)
+_GRID = 2.0**-19  # below which two trajectories are the same: networks round differently in different batches
+
+MakeEnv = Callable[..., EnvBase]
+
+
+def described_system(description: Mapping[str, Any], *, trust: bool = False) -> EnvFactory | None:
+    """Maker of the system that an agent's description names.
+
+    Args:
+        description: of an agent: ``config.env`` with an import path ``_target_`` and its arguments, or the name of an
+            environment of this library.
+        trust: import what is not of this library, too. An import path runs code: trust whom the agent comes from.
+
+    Returns:
+        The maker; None if the description names none, or one that is not to be trusted.
+
+    Source: none.
+
+    Example:
+        >>> described_system({"environment": "PendulumEnv"})(batch_size=[2], seed=0).batch_size
+        torch.Size([2])
+        >>> described_system({"config": {"env": {"_target_": "os.abort"}}}) is None
+        True
+    """
+    config = description.get("config")
+    spec = config.get("env") if isinstance(config, Mapping) else None
+    if not isinstance(spec, Mapping) or "_target_" not in spec:
+        named = description.get("environment")
+        spec = {"_target_": f"torchrl_sspl.envs.{named}"} if isinstance(named, str) and named.isidentifier() else None
+    if spec is None or not isinstance(spec["_target_"], str):
+        return None
+    try:
+        if not trust:
+            found = re.fullmatch(r"torchrl_sspl\.envs[.:](\w+)", spec["_target_"])
+            kind = resolve(spec["_target_"]) if found else None
+            if not (isinstance(kind, type) and issubclass(kind, SafetyEnv)):
+                return None
+        return EnvFactory(spec)
+    except (SSPLError, TypeError, ValueError):
+        return None
+
+
+def same_system(env: SafetyEnv, twin: Any) -> bool:
+    """Whether two systems move, look and are labelled the same, on a sample."""
+    if type(env) is not type(twin) or (env.state_dim, env.action_dim) != (twin.state_dim, twin.action_dim):
+        return False
+    g = torch.Generator().manual_seed(0)
+    state = env.sample_states(64, g, region=env.state_space)
+    action = env.action_low + torch.rand(64, env.action_dim, generator=g) * (env.action_high - env.action_low)
+
+    def seen(system: SafetyEnv) -> list[Tensor]:
+        moved = system.wrap(system.dynamics(state, action))
+        drawn = [system.draw(x) for x in (state[:16], system.previous_state(state)[:16])]
+        bounds = torch.tensor([system.exit_region, system.max_action])
+        return [
+            moved,
+            system.region(state),
+            system.region(moved),
+            system.action_low,
+            system.action_high,
+            bounds,
+            *drawn,
+        ]
+
+    return all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(seen(env), seen(twin), strict=True))
+
+
+def same_resets(make_env: MakeEnv, factory: MakeEnv) -> bool:
+    """Whether two makers give environments that begin and go on the same."""
+
+    def seen(make: MakeEnv) -> list[Tensor]:
+        env = make(batch_size=[2], seed=0)
+        try:
+            data = env.reset()
+            after = env.step(data.set("action", env.action_spec.zero()))["next"]
+            return [data["pixels"], data["region"], after["pixels"], after["region"]]
+        finally:
+            env.close()
+
+    try:
+        pairs = zip(seen(make_env), seen(factory), strict=True)
+        return all(a.shape == b.shape and torch.equal(a, b) for a, b in pairs)
+    except (SSPLError, RuntimeError, TypeError, ValueError, LookupError, AttributeError):
+        return False
+
+
+@dataclass
+class Block:
+    """What a block of episodes showed: counts for the record, and samples for the numbers beside them."""
+
+    counts: Counts
+    least: Counts  # without events that are so close that another machine may round them away
+    close: int  # starts that it may round out of the set or into it
+    error: Tensor  # (n,) largest of each episode
+    steps: Tensor  # (n,) of each episode
+    prints: list[str]  # of the episodes
+    labelled: list[str]  # of the labelled states
+    rims: dict[str, tuple[int, float]]
+    inside: Tensor  # (n, p) latents of the set
+    safe: Tensor  # barrier values of S
+    unsafe: Tensor  # of U
+    latent: Tensor  # latents whose distance to others is asked for
+    reference: Tensor  # these others
+
+
+def _values(e: Episodes) -> tuple[Tensor, Tensor]:
+    """Latents and barrier values, which episodes of an agent have."""
+    assert e.latent is not None
+    assert e.barrier is not None
+    return e.latent, e.barrier
+
+
+def _errors(e: Episodes) -> Tensor:
+    assert e.prediction_error is not None
+    return e.prediction_error
+
+
+def counted(e: Episodes, level: float, tolerated: float | None, slack: float = 0.0) -> tuple[dict[str, int], Tensor]:
+    """Events by name, those by more than a share of the barrier's range, and the largest error of each episode ``(n,)``."""
+    alive, barrier, unsafe = e.alive, _values(e)[1].double(), (e.region == UNSAFE) & e.alive
+    error = torch.where(alive[1:], _errors(e).double(), 0.0)
+    worst = torch.where(error.isnan(), math.inf, error).amax(0)
+    margin = slack * _range(barrier[alive], level)
+    events = {
+        "left": ((barrier > level + margin) & alive).any(0),
+        "entered": unsafe.any(0),
+        "aliased": (unsafe & (barrier <= level - margin)).any(0),
+        "undefined": (~barrier.isfinite() & alive).any(0) | ~worst.isfinite(),
+    }
+    events["events"] = torch.stack(list(events.values())).any(0)
+    exceeding = torch.ones_like(worst, dtype=torch.bool) if tolerated is None else ~(worst <= tolerated * (1 + slack))
+    return {k: int(v.sum()) for k, v in events.items()} | {"exceeding": int(exceeding.sum())}, worst
+
+
+def _range(barrier: Tensor, level: float) -> float:
+    """Largest distance of finite barrier values from the level."""
+    values = (barrier[barrier.isfinite()] - level).abs()
+    return float(values.max()) if values.numel() else 0.0
+
+
+def _rims(e: Episodes, level: float) -> dict[str, tuple[int, float]]:
+    """Steps and largest error, by where in the set a step began."""
+    rims, before = {}, _values(e)[1][:-1] - level
+    for name, (lower, upper) in RIMS.items():
+        here = _errors(e)[e.alive[1:] & (before > lower) & (before <= upper)]
+        if len(here) and bool(here.isfinite().all()):
+            rims[name] = (len(here), float(here.max()))
+    return rims
+
+
+class StateBlocks:
+    """Blocks of episodes on a system whose states are known."""
+
+    def __init__(
+        self, agent: Agent, env: SafetyEnv, record: Record, level: float, tolerated: float | None = None
+    ) -> None:
+        self.agent, self.env, self.record, self.level, self.tolerated = hosted(agent), env, record, level, tolerated
+
+    @torch.no_grad()
+    def __call__(self, index: int) -> Block:
+        agent, env, n = self.agent, self.env, self.record.size(index)
+        g = torch.Generator().manual_seed(spawn(self.record.seed, "certificate", index))
+        start, inside = self._from_set(n, g)
+        uniform = env.sample_states(n - n // 2, g, region=env.unsafe_set)
+        before, after = self._entering(n // 2, g)
+        unsafe_state = torch.cat([uniform, after])
+        unsafe_latent = self._see(torch.cat([env.previous_state(uniform), before]), unsafe_state)
+        safe_state = env.sample_states(n, g, region=env.safe_set)
+        safe_latent, reference_state = self._see(None, safe_state), env.sample_states(4 * n, g)
+        unsafe, safe = (agent.barrier(z)[:, 0] for z in (unsafe_latent, safe_latent))
+        latent = torch.cat([inside, unsafe_latent, safe_latent])
+        beyond = ~(latent.abs() <= 1.0).all(1)
+        run = self._run(start) if len(start) else None
+        counts, worst, steps = NOTHING, torch.zeros(0), torch.zeros(0, dtype=torch.int64)
+        rims: dict[str, tuple[int, float]] = {}
+        least = counts
+        if run is not None:
+            steps, rims = run.alive.sum(0) - 1, _rims(run, self.level)
+            found, worst = counted(run, self.level, self.tolerated)
+            sure = counted(run, self.level, self.tolerated, _BARELY)[0]
+            counts, least = (replace(NOTHING, episodes=len(start), steps=int(steps.sum()), **k) for k in (found, sure))
+        elif len(start):
+            counts = replace(
+                NOTHING, episodes=len(start), undefined=len(start), events=len(start), exceeding=len(start)
+            )
+            least, worst, steps = (
+                counts,
+                torch.full((len(start),), math.inf),
+                torch.zeros(len(start), dtype=torch.int64),
+            )
+        margin = _BARELY * _range(unsafe, self.level)
+        mistaken, surely = (int((~(unsafe > self.level - m)).sum()) for m in (0.0, margin))
+        seen = {"shown": len(unsafe), "seen": len(latent), "outside": int(beyond.sum())}
+        return Block(
+            replace(counts, mistaken=mistaken, **seen), replace(least, mistaken=surely, **seen), 0, worst, steps,
+            fingerprint(start), fingerprint(unsafe_state), rims, inside, safe, unsafe, latent, self._see(None, reference_state),
+        )  # fmt: skip
+
+    def _run(self, start: Tensor) -> Episodes | None:
+        """Episodes from the set; None where the policy gives no number, so that there are none."""
+        try:
+            run = simulate(AgentController(self.agent), self.env, start=start, horizon=self.record.horizon)
+        except NonFiniteError:
+            return None
+        if self.env.exit_region == SAFE and run.states is not None:  # who is gone is asked nothing any more
+            run.alive = run.alive & self.env.state_space.contains(run.states)
+        return run
+
+    def _see(self, before: Tensor | None, state: Tensor) -> Tensor:
+        """Latents of states."""
+        env, agent = self.env, self.agent
+        before = env.previous_state(state) if before is None else before
+        parts = zip(before.split(CHUNK), state.split(CHUNK), strict=True)
+        seen = [agent.encode(torch.cat([env.draw(a), env.draw(b)], dim=-3)) for a, b in parts if len(b)]
+        return torch.cat(seen) if seen else torch.zeros(0, agent.latent_dim)
+
+    def _from_set(self, n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Uniform states whose observation lies in the set, and their latents."""
+        states, latents, found = [], [], 0
+        for tried in range(1, 61):
+            state = self.env.sample_states(2 * n, g, region=self.env.state_space)
+            latent = self._see(None, state)
+            kept = self.agent.barrier(latent)[:, 0] <= self.level
+            states.append(state[kept])
+            latents.append(latent[kept])
+            found += int(kept.sum())
+            if found >= n or (tried == 10 and found == 0):  # of 20 n states none: the set is as good as empty
+                break
+        return torch.cat(states)[:n], torch.cat(latents)[:n]
+
+    def _entering(self, n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
+        """States of U that one step under a uniform random action leads into, and the states before it."""
+        env, before, after, found = self.env, [], [], 0
+        for _ in range(60):
+            state = env.sample_states(max(4 * n, 2000), g, region=env.state_space)
+            action = env.action_low + torch.rand(len(state), env.action_dim, generator=g) * (
+                env.action_high - env.action_low
+            )
+            moved = env.wrap(env.dynamics(state, action))
+            enters = (env.region(state) != UNSAFE)[:, 0] & (env.region(moved) == UNSAFE)[:, 0]
+            before.append(state[enters])
+            after.append(moved[enters])
+            found += int(enters.sum())
+            if found >= n:
+                break
+        return torch.cat(before)[:n], torch.cat(after)[:n]
+
+
+class ResetBlocks:
+    """Blocks of episodes from an environment's own resets; steps behind their end do not count."""
+
+    def __init__(
+        self, agent: Agent, make_env: MakeEnv, record: Record, level: float, tolerated: float | None = None
+    ) -> None:
+        self.agent, self.make_env, self.record, self.level, self.tolerated = agent, make_env, record, level, tolerated
+
+    @torch.no_grad()
+    def __call__(self, index: int) -> Block:
+        record, level = self.record, self.level
+        n, root = record.size(index), record.seed
+        env = self.make_env(batch_size=[record.envs], seed=spawn(root, "certificate", index))
+        try:
+            own = simulate(AgentController(self.agent), env, episodes=n, horizon=record.horizon)
+            chance = RandomController.within(env, spawn(root, "certificate actions", index))
+            at_random = simulate(AgentController(self.agent, chance), env, episodes=n, horizon=record.horizon)
+        except NonFiniteError:  # the policy gives no number
+            return _undefined(n, self.agent.latent_dim)
+        finally:
+            env.close()
+        both = own.joined(at_random)
+        own_latent, own_barrier = _values(own)
+        latent, barrier = _values(both)
+        start = own.select(~(own_barrier[0] > level))  # a start that is no number counts, as an event
+        shown, margin = (both.region == UNSAFE) & both.alive, _BARELY * _range(barrier[both.alive], level)
+        seen = latent[both.alive]
+        counts, least = (
+            replace(
+                NOTHING, episodes=len(start), steps=int(start.alive[1:].sum()), **counted(start, level, self.tolerated, s)[0],
+                shown=int(shown.any(0).sum()), mistaken=int((shown & ~(barrier > level - m)).any(0).sum()),
+                seen=len(seen), outside=int((~(seen.abs() <= 1.0).all(1)).sum()),
+            )
+            for s, m in ((0.0, 0.0), (_BARELY, margin))
+        )  # fmt: skip
+        near = ((own_barrier[0] - level).abs() <= margin).sum()
+        worst = counted(start, level, self.tolerated)[1]
+        mine, inside = own_latent[own.alive], own_barrier[own.alive] <= level
+        safe = barrier[(both.region == SAFE) & both.alive]
+        return Block(
+            counts, least, int(near), worst, start.alive.sum(0) - 1, _trajectories(start), [], _rims(start, level),
+            mine[inside], safe, barrier[shown], mine, _values(at_random)[0][at_random.alive],
+        )  # fmt: skip
+
+
+def _undefined(n: int, p: int) -> Block:
+    """Episodes that there are none of, as the policy gives no number: every one of them is an event."""
+    counts = replace(NOTHING, episodes=n, undefined=n, events=n, exceeding=n, shown=n, mistaken=n)
+    lost, none, nowhere = torch.full((n,), math.inf), torch.zeros(0), torch.zeros(0, p)
+    steps = torch.zeros(n, dtype=torch.int64)
+    return Block(
+        counts, counts, 0, lost, steps, [str(k) for k in range(n)], [], {}, nowhere, none, none, nowhere, nowhere
+    )
+
+
+def _trajectories(e: Episodes) -> list[str]:
+    """Fingerprints of where episodes begin, go on and end: of true states, or of latents where those are not told."""
+    path = e.states if e.states is not None else e.latent
+    assert path is not None
+    if not len(e):
+        return []
+    last = e.alive.sum(0) - 1
+    picked = [path[torch.minimum(last, torch.tensor(k)), torch.arange(len(e))] for k in (0, 1, 2)]
+    return fingerprint(
+        torch.cat([*picked, path[last, torch.arange(len(e))], last[:, None].to(path.dtype)], 1), grid=_GRID
+    )
+
+
+def summarise(record: Record, blocks: Sequence[Block], agent: Agent) -> None:
+    """Fills in what needs all blocks: lengths, repetitions, errors, and the samples of the paper's conditions."""
+    agent = hosted(agent)
+    steps = torch.cat([b.steps for b in blocks])
+    error, prints = torch.cat([b.error.double() for b in blocks]), [p for b in blocks for p in b.prints]
+    trained_on = agent.description.get("trained_on")
+    known = {str(p) for p in trained_on} if isinstance(trained_on, list) else set()
+    g = torch.Generator().manual_seed(spawn(record.seed, "certificate", 2**24 - 1))
+
+    def some(rows: Tensor) -> Tensor:  # the covering radius compares all pairs
+        return rows[torch.randperm(len(rows), generator=g)[:_COVERED]] if record.kind == "resets" else rows
+
+    inside, safe, unsafe, latent, reference = (
+        torch.cat([getattr(b, k) for b in blocks]) for k in ("inside", "safe", "unsafe", "latent", "reference")
+    )
+    try:
+        constant = closed_loop_lipschitz(agent.dynamics, agent.policy)
+    except ConfigError:
+        constant = math.inf
+    with torch.no_grad():
+        following = agent.barrier(agent.dynamics(inside, agent.policy(inside)))[:, 0]
+    finite = bool(latent.isfinite().all()) and bool(reference.isfinite().all())
+    radius = covering_radius(some(latent), some(reference)) if finite and len(latent) and len(reference) else math.nan
+    sizes, numbers = paper_numbers(
+        safe=safe,
+        unsafe=unsafe,
+        following=following,
+        lipschitz_bound=agent.lipschitz_bound,
+        covering_radius=radius,
+        dynamics_error=float(error.max()) if len(error) else math.nan,
+        closed_loop_constant=constant,
+    )
+    n = len(steps)
+    lengths = {"shortest": int(steps.min()), "median": int(steps.median()), "longest": int(steps.max())} if n else {}
+    leaked = sum(p in known for b in blocks for p in b.labelled)
+    # From resets no states are told: nothing can be compared.
+    seen = len(known) if record.kind == "states" else 0
+    sizes |= lengths | {"repeated": n - len(set(prints)), "trained_on": seen, "leaked": leaked}
+    record.sizes |= sizes
+    bound = largest_error_bound(error, record.confidence) if n else math.nan
+    numbers |= {"episode_error": bound}
+    record.numbers |= {k: v if math.isfinite(v) else None for k, v in numbers.items()}
+    record.rims = []
+    for name in RIMS:
+        found = [b.rims[name] for b in blocks if name in b.rims]
+        if found:
+            record.rims.append((name, sum(k for k, _ in found), max(e for _, e in found)))

@@ -1,0 +1,596 @@
+"""Certificates of trained agents: issue one, and check one again from the weights and from fresh episodes."""
+
+from __future__ import annotations
+
+import json
+import math
+import random
+import re
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, maximise
+from torchrl_sspl.certification.certificate import (
+    ASSUMED,
+    TOLERATED,
+    Certificate,
+    Layer,
+    Reason,
+    Statement,
+    configuration_digest,
+    differences,
+    weights_digest,
+)
+from torchrl_sspl.certification.conditions import closed_loop
+from torchrl_sspl.certification.floating import UNITS, largest_rounding
+from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
+from torchrl_sspl.certification.record import Counts, Record
+from torchrl_sspl.certification.rounding import missed, shown
+from torchrl_sspl.certification.statistics import (
+    paper_layer,
+    statistical_layer,
+)
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import CertificationError, CheckpointError, SSPLError
+from torchrl_sspl.evaluation.blocks import (
+    Block,
+    MakeEnv,
+    ResetBlocks,
+    StateBlocks,
+    described_system,
+    same_resets,
+    same_system,
+    summarise,
+)
+from torchrl_sspl.modules.agent import Agent, agent_directory
+
+CERTIFICATE_FILE = "certificate.json"
+_BROKEN = (SSPLError, ImportError, RuntimeError, TypeError, ValueError)
+#: What a certificate is about; everything else in the description (the certificate's own traces, notes) may change.
+_CERTIFIED_KEYS = ("networks", "config", "training", "lipschitz", "seeds", "environment", "trained_on")
+
+
+class Exit(IntEnum):
+    """Exit codes of ``sspl verify``."""
+
+    HOLDS = 0  # everything that was checked was found again, whatever it says
+    REFUSED = 1  # something is claimed that is not so
+    USAGE = 2  # no such agent, or a wrong argument
+    MALFORMED = 3  # there is no certificate, or the file is none
+    AGENT = 4  # the agent cannot be read
+    TIME = 5  # nothing was found wrong, but not everything was found again in the time
+
+
+def certify(
+    agent: Agent,
+    env: SafetyEnv | None,
+    *,
+    name: str = "agent",
+    level: float | None = None,
+    episodes: int = 3000,
+    horizon: int = 200,
+    seed: int | None = None,
+    used_seeds: Sequence[int] = (),
+    confidence: float = 0.95,
+    acceptable: float = 0.01,
+    budget: Budget | None = None,
+    progress: bool = False,
+) -> Certificate:
+    r"""Certifies a frozen agent: the set {B <= s} with the largest s <= 0 that is proved to be kept.
+
+    Args:
+        agent: frozen agent.
+        env: the true system, for the layers that are measured; without one, only what the weights prove.
+        name: name of the agent.
+        level: s, barrier units; searched for if not given.
+        episodes: number of fresh episodes from the set, and of fresh observations of U.
+        horizon: steps per episode.
+        seed: root of the seeds of the fresh data, which are drawn in a purpose of their own; default: that of the agent's
+            configuration.
+        used_seeds: seeds with which anything was trained, chosen or tuned, beside those that the agent itself names.
+        confidence: of all bounds together.
+        acceptable: risk per episode, and per observation of U, above which a bound does not hold.
+        budget: of each search of the deterministic layer.
+        progress: show progress bars.
+
+    Returns:
+        The certificate.
+
+    Raises:
+        ConfigError: if a setting is out of range.
+
+    Source: paper Theorem 1; deviation: proved on the whole latent domain, and measured on fresh episodes.
+
+    Example:
+        >>> from torchrl_sspl.modules.agent import load
+        >>> certify(load("pendulum"), None, name="pendulum").layers["deterministic"].holds
+        True
+    """
+    if env is None:
+        return _proved(agent, name, level, budget)
+    factory = described_system(agent.description)
+    system = "described" if factory is not None and same_system(env, factory([1], 0)) else "given"
+    root = _root_seed(agent) if seed is None else seed
+    record = Record("states", system, root, episodes, horizon, 1, confidence, acceptable, _used(agent, used_seeds))
+    certificate = _proved(agent, name, level, budget)
+    _measure(certificate, agent, StateBlocks(agent, env, record, certificate.level), record, progress)
+    return certificate
+
+
+def certify_on_episodes(
+    agent: Agent,
+    make_env: MakeEnv,
+    *,
+    name: str = "agent",
+    level: float | None = None,
+    episodes: int = 1000,
+    horizon: int = 50,
+    envs: int = 20,
+    seed: int | None = None,
+    used_seeds: Sequence[int] = (),
+    confidence: float = 0.95,
+    acceptable: float = 0.01,
+    budget: Budget | None = None,
+    progress: bool = False,
+) -> Certificate:
+    r"""Certifies a frozen agent for an environment that is known only by being run.
+
+    What the weights prove is the same as with :func:`certify`. What is measured are episodes from the environment's own
+    resets, half under the policy, half under random actions: those under the policy that start in the set, and of all that
+    show U, whether one observation of it has B <= s. Episodes are drawn in blocks, each from a newly made and seeded
+    environment, until there are enough of both; when to stop depends on their numbers alone, never on what happened in them.
+
+    Args:
+        agent: frozen agent.
+        make_env: ``(batch_size=[k], seed=...) -> environment`` with ``"pixels"`` and ``"region"``.
+        name: name of the agent.
+        level: s, barrier units; searched for if not given.
+        episodes: number of fresh episodes from the set, and of fresh episodes that show U. At least as many are drawn
+            under the policy, and under random actions, and at most three times as many.
+        horizon: steps per episode.
+        envs: environments stepped together.
+        seed: as for :func:`certify`.
+        used_seeds: as for :func:`certify`.
+        confidence: as for :func:`certify`.
+        acceptable: as for :func:`certify`.
+        budget: of each search.
+        progress: show progress bars.
+
+    Returns:
+        The certificate.
+
+    Raises:
+        ConfigError: if a setting is out of range.
+
+    Source: paper Theorem 1; deviation: as for :func:`certify`.
+
+    Example:
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> from torchrl_sspl.modules.agent import load
+        >>> certificate = certify_on_episodes(load("pendulum"), PendulumEnv, episodes=4, horizon=3, envs=4)
+        >>> sorted(certificate.layers)
+        ['deterministic', 'paper', 'statistical']
+    """
+    factory = described_system(agent.description)
+    system = "described" if factory is not None and same_resets(make_env, factory) else "given"
+    root = _root_seed(agent) if seed is None else seed
+    record = Record("resets", system, root, episodes, horizon, envs, confidence, acceptable, _used(agent, used_seeds))
+    certificate = _proved(agent, name, level, budget)
+    _measure(certificate, agent, ResetBlocks(agent, make_env, record, certificate.level), record, progress)
+    return certificate
+
+
+def issue(path: str | Path, env: SafetyEnv | MakeEnv | None = None, **settings: Any) -> Certificate:
+    """Certifies the agent of a directory anew, and keeps the certificate beside it.
+
+    Args:
+        path: name of a shipped agent, a run directory or the directory of an agent.
+        env: the true system, or a maker of environments; default: as the agent's description says.
+        **settings: those of :func:`certify` or :func:`certify_on_episodes`; default: those of the present certificate.
+
+    Returns:
+        The certificate.
+
+    Raises:
+        CheckpointError: if the agent cannot be read.
+
+    Source: none.
+    """
+    directory = agent_directory(path)
+    agent = Agent.load(directory)
+    try:
+        before = Certificate.load(directory / CERTIFICATE_FILE)
+        settings = {"name": before.agent} | settings
+        if before.record is not None:
+            kept = ("episodes", "horizon", "seed", "confidence", "acceptable")
+            settings = {k: getattr(before.record, k) for k in kept} | settings
+    except CertificationError:
+        settings = {"name": directory.parent.name if directory.name == "agent" else directory.name} | settings
+    if env is None:
+        factory = described_system(agent.description, trust=True)
+        made = None if factory is None else factory([1], 0)
+        env = made if isinstance(made, SafetyEnv) else factory
+    if env is None or isinstance(env, SafetyEnv):
+        certificate = certify(agent, env, **settings)
+    else:
+        certificate = certify_on_episodes(agent, env, **settings)
+    certificate.save(directory / CERTIFICATE_FILE)
+    return certificate
+
+
+def _root_seed(agent: Agent) -> int:
+    """Seed of the agent's own configuration, from which every other purpose of the run is drawn, too."""
+    for section in ("config", "training"):
+        seed = (agent.description.get(section) or {}).get("seed")
+        if type(seed) is int and seed >= 0:
+            return seed
+    return 20260707
+
+
+def _used(agent: Agent, more: Sequence[int]) -> list[int] | None:
+    """Every seed with which the agent was trained, chosen or tuned; None where nobody says."""
+    recorded = agent.description.get("seeds")
+    if not isinstance(recorded, list) or not all(type(s) is int for s in recorded):
+        return sorted({int(s) for s in more}) or None
+    return sorted({*recorded, *(int(s) for s in more)})
+
+
+def _proved(agent: Agent, name: str, level: float | None, budget: Budget | None) -> Certificate:
+    """A certificate with what the weights prove."""
+    budget = budget or Budget(seconds=300.0)
+    if level is None:
+        parts = (agent.barrier, agent.dynamics, agent.policy)
+        options: dict[str, Any] = {"latent_dim": agent.latent_dim, "lipschitz_bound": agent.lipschitz_bound}
+        level = level_that_holds(*parts, **options, budget=budget)
+    label = re.sub(r"[^\w .,()+-]", "_", name)[:80] or "agent"
+    layers = {"deterministic": _proof(agent, level, budget)}
+    return Certificate(label, weights_digest(agent.state_dict()), _configuration(agent), level, layers)
+
+
+def _configuration(agent: Agent) -> str:
+    certified = {k: agent.description.get(k) for k in _CERTIFIED_KEYS} | {"lipschitz_bound": agent.lipschitz_bound}
+    return configuration_digest(certified)
+
+
+def _proof(agent: Agent, level: float, budget: Budget) -> Layer:
+    return deterministic_layer(
+        agent.barrier,
+        agent.dynamics,
+        agent.policy,
+        latent_dim=agent.latent_dim,
+        lipschitz_bound=agent.lipschitz_bound,
+        level=level,
+        multipliers=_witness(agent),
+        budget=budget,
+    )
+
+
+def _witness(agent: Agent) -> list[Tensor] | None:
+    """Multipliers that travel with the agent, as a witness of its Lipschitz constant."""
+    lipschitz = agent.description.get("lipschitz") or {}
+    rows = lipschitz.get("multipliers") if isinstance(lipschitz, Mapping) else lipschitz
+    if rows is None:
+        return None
+    plain = isinstance(rows, list) and all(isinstance(r, list) for r in rows)
+    if not plain or not all(type(v) in (int, float) and math.isfinite(v) for row in rows for v in row):
+        raise CheckpointError(
+            "expected the agent's Lipschitz multipliers to be lists of finite numbers; restore agent.json"
+        )
+    return [torch.tensor(row, dtype=torch.float64) for row in rows]
+
+
+def _measure(certificate: Certificate, agent: Agent, source: Any, record: Record, progress: bool) -> None:
+    """Draws blocks until there are enough, and adds the layers that follow."""
+    from tqdm import tqdm
+
+    source.tolerated = _tolerated(certificate)
+    blocks: list[Block] = []
+    with tqdm(desc="certificate", unit="block", disable=not progress, leave=False) as bar:
+        while not record.complete():
+            blocks.append(source(len(blocks)))
+            record.blocks.append(blocks[-1].counts)
+            bar.update()
+    summarise(record, blocks, agent)
+    record.check()
+    certificate.record = record
+    certificate.layers |= _measured_layers(record, certificate, agent)
+
+
+def _tolerated(certificate: Certificate) -> float | None:
+    proof = certificate.layers["deterministic"]
+    return next((s.value for s in proof.statements if s.name == TOLERATED), None)
+
+
+def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> dict[str, Layer]:
+    return {
+        "statistical": statistical_layer(record, level=certificate.level, tolerated_error=_tolerated(certificate)),
+        "paper": paper_layer(record, agent.lipschitz_bound),
+    }
+
+
+# --- verification -----------------------------------------------------------------------------------------------------
+
+
+class _TimeUp(Exception):
+    """The time for a verification is over."""
+
+
+class _Stop(Exception):
+    """A verification ends with a reason and an exit code."""
+
+    def __init__(self, code: Exit, *lines: str) -> None:
+        super().__init__(*lines)
+        self.code, self.lines = code, lines
+
+
+def verify_run(
+    name: str | Path,
+    *,
+    env: SafetyEnv | MakeEnv | None = None,
+    measure: bool | None = None,
+    seconds: float = 60.0,
+    report: Callable[[str], None] = print,
+) -> int:
+    """Checks a certificate again: every number and word of it, from the weights and from the same episodes.
+
+    Digest, weights, configuration and every measured statement (which follow from the counts) are compared first, then the
+    proofs are found again, then blocks of episodes are measured again, in an order that nobody can foresee, as many as a third
+    of the time allows. What is not checked again is printed as claimed.
+
+    Args:
+        name: name of a shipped agent, a run directory or the directory of an agent.
+        env: the true system, or a maker of environments, where the agent does not say how to build it.
+        measure: True: measure all blocks again, whatever time it takes, and import the system that the agent names, wherever
+            it comes from (it runs code of its own); False: none; default: as above, with systems of this library only.
+        seconds: time for everything (without ``measure=True``).
+        report: called with every line that a person should read.
+
+    Returns:
+        An exit code, see :class:`Exit`: 0 if everything was found again, 1 if something is claimed that is not so, 3 if there
+        is no certificate or the file is none, 4 if the agent cannot be read, 5 if the time was too short; the reasons are
+        reported.
+
+    Raises:
+        CheckpointError: if there is no such agent.
+
+    Source: none.
+
+    Example:
+        >>> verify_run("pendulum", measure=False, report=lambda line: None)
+        0
+    """
+    directory = agent_directory(name)
+    try:
+        with _limit(math.inf if measure else seconds):
+            _verify(directory, env, measure, seconds, report)
+        return int(Exit.HOLDS)
+    except _TimeUp:
+        report(f"FAILED {Reason.UNDECIDED.name}: not checked within {seconds:g} s; give it more (seconds)")
+        return int(Exit.TIME)
+    except _Stop as stop:
+        for line in stop.lines:
+            report(line)
+        return int(stop.code)
+    except (*_BROKEN, AttributeError, ArithmeticError, LookupError, MemoryError) as error:
+        report(f"FAILED the agent cannot be checked: {type(error).__name__}: {str(error)[:300]}")
+        return int(Exit.AGENT)
+
+
+@contextmanager
+def _limit(seconds: float) -> Iterator[None]:
+    """Raises _TimeUp in the block after a while, where the platform can interrupt it (the main thread, not on Windows)."""
+    usable = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    if not usable or not math.isfinite(seconds):
+        yield
+        return
+
+    def over(*_: Any) -> None:
+        raise _TimeUp
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _verify(
+    directory: Path,
+    env: SafetyEnv | MakeEnv | None,
+    measure: bool | None,
+    seconds: float,
+    report: Callable[[str], None],
+) -> None:
+    try:
+        claimed = Certificate.load(directory / CERTIFICATE_FILE)
+    except CertificationError as error:
+        raise _Stop(Exit.MALFORMED, f"FAILED {Reason.SCHEMA_UNKNOWN.name}: {error}") from error
+    try:
+        agent = Agent.load(directory)
+        _witness(agent)
+    except CheckpointError as error:
+        raise _Stop(Exit.AGENT, f"FAILED the agent cannot be read: {error}") from error
+    began = time.monotonic()
+    again = Certificate(claimed.agent, weights_digest(agent.state_dict()), _configuration(agent), claimed.level, {})
+    again.layers["deterministic"] = claimed.layers["deterministic"]  # first what takes no time
+    if claimed.record is not None:
+        again.layers |= _measured_layers(claimed.record, claimed, agent)
+    found = differences(claimed, again) | _history(claimed, agent)
+    _refuse(found)
+    budget = Budget(seconds=seconds / 3)
+    again.layers["deterministic"] = _proof(agent, claimed.level, budget)
+    found = differences(
+        claimed,
+        again,
+        confirm=lambda name, delta: _is_proved(agent, claimed.level, name, delta, budget),
+        repeat=lambda boxes: _proof(agent, claimed.level, Budget(boxes=boxes, seconds=seconds / 3)),
+    )
+    _refuse(found)
+    left = math.inf if measure else min(seconds / 3, seconds - (time.monotonic() - began))
+    measured = _measured_again(claimed, agent, env, measure, left)
+    _print(claimed, agent, again, measured, report)
+
+
+def _refuse(found: Mapping[Reason, str]) -> None:
+    if found:
+        code = Exit.TIME if set(found) == {Reason.UNDECIDED} else Exit.REFUSED
+        raise _Stop(code, *(f"FAILED {reason.name}: {reason.value} ({detail})" for reason, detail in found.items()))
+
+
+def _history(claimed: Certificate, agent: Agent) -> dict[Reason, str]:
+    """Whether the record names every seed that the agent names."""
+    if claimed.record is None:
+        return {}
+    named, record = _used(agent, ()), claimed.record.used
+    missing = set(named or ()) - set(record or ())
+    if missing or (named is not None and record is None):
+        return {Reason.RECORD_CHANGED: f"expected the seeds of the training, {len(missing)} are missing"}
+    return {}
+
+
+def _is_proved(agent: Agent, level: float, name: str, delta: float, budget: Budget) -> bool | None:
+    """Whether the set is kept with errors of delta, by real numbers or by those of a dtype; None: not decided."""
+    bound = agent.lipschitz_bound
+    parts = (agent.barrier, agent.dynamics, agent.policy)
+    system = closed_loop(*parts, latent_dim=agent.latent_dim, lipschitz_bound=bound)
+    inside, lost = level, 0.0
+    if name != TOLERATED:
+        unit = UNITS[getattr(torch, name)]
+        of_barrier, of_step = (
+            largest_rounding(g, system.low, system.high, unit) for g in (system.barrier, system.step)
+        )
+        inside, lost = level + of_barrier + SLACK, of_step + of_barrier / bound
+    problem = system.problem(level=inside, constant=(bound * (delta + lost) - level,))
+    return {"proved": True, "refuted": False}.get(maximise(problem, threshold=0.0, budget=budget).status)
+
+
+def _measured_again(
+    claimed: Certificate, agent: Agent, env: SafetyEnv | MakeEnv | None, measure: bool | None, seconds: float
+) -> str:
+    """Blocks of the same episodes; says what was checked, "" if everything."""
+    record = claimed.record
+    if record is None:
+        return "nothing was measured"
+    if measure is False:
+        return "not asked for"
+    if env is None:
+        if record.system == "given":
+            return "its system was given in code; give it to verify_run(env=...)"
+        factory = described_system(agent.description, trust=bool(measure))
+        if factory is None:
+            return "its system is built by code of its own; --measure runs it"
+        try:
+            env = factory([1], 0)
+        except _BROKEN as error:
+            return f"its system cannot be built here: {type(error).__name__}: {str(error)[:200]}"
+        env = env if record.kind == "states" else factory
+    kind: Any = StateBlocks if record.kind == "states" else ResetBlocks
+    if (record.kind == "states") != isinstance(env, SafetyEnv):
+        raise _Stop(Exit.REFUSED, f"FAILED {Reason.RECORD_CHANGED.name}: the episodes are of another kind of system")
+    source = kind(agent, env, record, claimed.level, _tolerated(claimed))
+    order, began = list(range(len(record.blocks))), time.monotonic()
+    random.SystemRandom().shuffle(order)
+    blocks: dict[int, Block] = {}
+    try:
+        for index in order:
+            blocks[index] = source(index)
+            changes = _block_changes(record.blocks[index], blocks[index])
+            if changes:
+                _refuse({Reason.RECORD_CHANGED: f"block {index}: {changes}"})
+            if (time.monotonic() - began) * (1 + 1 / len(blocks)) > seconds and len(blocks) < len(order):
+                return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random"
+    except _TimeUp:
+        if not blocks:
+            raise
+        return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random"
+    fresh = replace(record, blocks=list(record.blocks), sizes={}, numbers={}, rims=[])
+    summarise(fresh, [blocks[k] for k in sorted(blocks)], agent)
+    changes = _summary_changes(record, fresh, sum(b.close for b in blocks.values()))
+    if changes:
+        _refuse({Reason.RECORD_CHANGED: changes})
+    return ""
+
+
+def _block_changes(claimed: Counts, block: Block) -> str:
+    """Counts that are better than those measured again, but for an event that is close."""
+    found, least, close = asdict(block.counts), asdict(block.least), block.close
+    longest = int(block.steps.max()) if len(block.steps) else 0
+    slack = {"episodes": close, "shown": close, "steps": close * longest, "seen": close * (longest + 1)}
+    wrong = [k for k, most in slack.items() if abs(getattr(claimed, k) - found[k]) > most]
+    events = ("left", "entered", "aliased", "undefined", "events", "exceeding", "mistaken", "outside")
+    wrong += [k for k in events if getattr(claimed, k) < max(least[k], found[k] - 1)]
+    return ", ".join(f"{k} claimed {getattr(claimed, k)}, measured {found[k]}" for k in wrong)
+
+
+def _summary_changes(claimed: Record, found: Record, close: int) -> str:
+    """Numbers beside the counts that are not those measured again."""
+    wrong = []
+    for name, value in claimed.sizes.items():
+        slack = close + 2 if name in ("repeated", "leaked") else close + max(2, found.sizes[name] // 500)
+        if not value >= found.sizes[name] - slack or (
+            name not in ("repeated", "leaked") and value > found.sizes[name] + slack
+        ):
+            wrong.append(f"{name} claimed {value}, measured {found.sizes[name]}")
+    for key, number in claimed.numbers.items():
+        other = found.numbers[key]
+        if (number is None) != (other is None) or (
+            number is not None and other is not None and not math.isclose(number, other, rel_tol=1e-2, abs_tol=1e-6)
+        ):
+            wrong.append(f"{key} claimed {number}, measured {other}")
+    if [r[0] for r in claimed.rims] != [r[0] for r in found.rims] or any(
+        abs(a[1] - b[1]) > close * claimed.horizon + max(3, b[1] // 100)
+        or not math.isclose(a[2], b[2], rel_tol=1e-2, abs_tol=1e-6)
+        for a, b in zip(claimed.rims, found.rims, strict=True)
+    ):
+        wrong.append("errors by part of the set")
+    return "; ".join(wrong)
+
+
+def _print(
+    claimed: Certificate, agent: Agent, again: Certificate, unmeasured: str, report: Callable[[str], None]
+) -> None:
+    """Every statement, with what was done about it."""
+    for layer in claimed.layers.values():
+        proof = layer.name == "deterministic"
+        partly = not proof and unmeasured.endswith("at random") and layer.name == "statistical"
+        checked = "checked again" if proof or not unmeasured else f"not checked again ({unmeasured})"
+        if partly:
+            checked = f"checked again on {unmeasured}"
+        report(f"{layer.name:14s} {checked}: {layer.verdict}")
+        for s in layer.statements:
+            report(_line(s, proof or not unmeasured))
+    report(f"OK: the weights are {claimed.weights[:12]}..., and the certificate says what they prove")
+    if unmeasured and claimed.record is not None:
+        report("What is printed as claimed was not checked again; that its words and bounds follow from its counts was")
+    open_layers = [layer.name for layer in claimed.layers.values() if not layer.holds]
+    if open_layers:
+        report(f"What it says is that these layers are not certified: {', '.join(open_layers)}")
+
+
+def _line(s: Statement, checked: bool) -> str:
+    """One statement for people, its numbers rounded to the side on which they are still true."""
+    size = "" if s.n is None else f"n = {s.n:,}"
+    sample = ", ".join(x for x in (size, "" if s.confidence is None else f"{100 * s.confidence:g} %") if x)
+    missing = f", misses by {missed(s)}" if missed(s) else ""
+    status = "FAILS" if s.holds is False else s.kind if checked or s.kind == ASSUMED else "claimed"
+    text = f"{s.text} {shown(s)}".rstrip() + (f" ({sample})" if sample else "")
+    return f"    {status:9s} {text}{missing}" + (f" [{s.detail}]" if s.detail else "")
+
+
+if __name__ == "__main__":
+    import sys
+
+    for argument in sys.argv[1:]:
+        print(json.dumps({argument: {k: v.verdict for k, v in issue(argument).layers.items()}}, indent=1))

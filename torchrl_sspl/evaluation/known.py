@@ -1,0 +1,395 @@
+"""Measurements on a system with known dynamics: against its true kernel, on a grid and on fresh episodes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl import functional
+from torchrl_sspl.configs.schema import EvaluationConfig
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, Camera, Controller, as_controller
+from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, quantiles, share
+from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.lipschitz import lipschitz_lower
+from torchrl_sspl.modules.agent import Agent, hosted
+from torchrl_sspl.sets import Region
+from torchrl_sspl.viability.grid import ViabilityKernel, recoverable_set, viability_kernel
+
+
+@torch.no_grad()
+def encode_states(agent: Agent, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None) -> Tensor:
+    """Latents of true states, seen through two frames, in chunks that fit the memory.
+
+    Args:
+        agent: frozen agent.
+        env: gives the state one step earlier, and the pictures.
+        state: ``(n, state_dim)``.
+        draw: states ``(n, state_dim)`` -> frames ``(n, 3, H, W)`` uint8; default ``env.draw``.
+
+    Returns:
+        ``(n, p)`` latents.
+
+    Source: none.
+    """
+    agent, draw = hosted(agent), draw or env.draw
+    if not len(state):
+        return torch.zeros(0, agent.latent_dim)
+    return torch.cat(
+        [agent.encode(torch.cat([draw(env.previous_state(x)), draw(x)], dim=-3)) for x in state.split(CHUNK)]
+    )
+
+
+def barrier_of(acts: Any, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None) -> Tensor | None:
+    """Barrier values of true states, of anything that acts.
+
+    Args:
+        acts: see ``as_controller``; its memory is reset.
+        env: gives the pictures.
+        state: ``(n, state_dim)``.
+        draw: states -> frames; default ``env.draw``.
+
+    Returns:
+        ``(n,)``; None without a barrier.
+
+    Source: none.
+    """
+    acts = as_controller(acts)
+    if isinstance(acts, AgentController):
+        return acts.agent.barrier(encode_states(acts.agent, env, state, draw=draw))[:, 0]
+    values = []
+    for part in state.split(CHUNK):
+        acts.reset()
+        camera = Camera(draw or env.draw, part, env.previous_state(part))
+        seen = part if acts.reads == "state" else torch.cat(list(camera.pixels()))
+        value = getattr(acts, "watch", acts.step)(seen).barrier
+        if value is None:
+            return None
+        values.append(value)
+    return torch.cat(values) if values else torch.zeros(0)
+
+
+def states_where(
+    keep: Callable[[Tensor], Tensor], space: Region, n: int, generator: torch.Generator, draws: int = 60
+) -> Tensor:
+    """Up to n states of a region for which a condition holds, uniformly, by rejection.
+
+    Args:
+        keep: states ``(k, state_dim)`` -> bool ``(k,)``.
+        space: where they are drawn from.
+        n: how many are wanted.
+        generator: of the draws.
+        draws: how often at least 2000 are drawn at most.
+
+    Returns:
+        ``(at most n, state_dim)``.
+
+    Source: none.
+
+    Example:
+        >>> from torchrl_sspl.sets import Box
+        >>> states_where(lambda x: x[:, 0] > 0, Box([-1.0], [1.0]), 5, torch.Generator()).shape
+        torch.Size([5, 1])
+    """
+    kept: list[Tensor] = []
+    found = 0
+    for drawn in range(1, draws + 1):
+        state = space.sample(max(n, 2000), generator=generator)
+        state = state[keep(state)]
+        kept.append(state)
+        found += len(state)
+        if found >= n or (drawn == 5 and not found):  # of five times as many none: as good as empty
+            break
+    return torch.cat(kept)[:n]
+
+
+@dataclass
+class _Run:
+    """What all parts of one evaluation share."""
+
+    acts: Controller
+    agent: Agent | None
+    env: SafetyEnv
+    config: EvaluationConfig
+    kernel: ViabilityKernel
+    draw: Draw | None
+    n: int
+    grid: int
+    progress: bool
+    generator: torch.Generator
+    out: Evaluation = field(default_factory=Evaluation)
+
+    def barrier(self, state: Tensor) -> Tensor | None:
+        return barrier_of(self.acts, self.env, state, draw=self.draw)
+
+    def inside(self, state: Tensor) -> Tensor:
+        value = self.barrier(state)
+        return torch.zeros(len(state), dtype=torch.bool) if value is None else value <= 0
+
+    def episodes(self, start: Tensor, where: str) -> Episodes:
+        label = f"episodes from {where}" if self.progress else None
+        return simulate(self.acts, self.env, start=start, horizon=self.config.horizon, draw=self.draw, label=label)
+
+    def sizes(self, own: int | tuple[int, ...], n: int) -> int | tuple[int, ...]:
+        """Of a grid: the system's own, or n along its finest coordinate and the others in proportion."""
+        if isinstance(own, int) or not n:
+            return n or own
+        return tuple(max(2, round(k * n / max(own))) for k in own)
+
+
+@torch.no_grad()
+def evaluate(
+    agent: Any,
+    env: SafetyEnv,
+    config: EvaluationConfig | None = None,
+    *,
+    kernel: ViabilityKernel | None = None,
+    draw: Draw | None = None,
+    episodes: int | None = None,
+    grid: int | None = None,
+    progress: bool = False,
+) -> Evaluation:
+    r"""Measures an agent, or anything else that acts, on fresh data against the true system.
+
+    Args:
+        agent: frozen agent, or what ``as_controller`` takes: a bare policy, a policy of another library. What needs a
+            barrier (or an encoder, or a model) is not measured without one.
+        env: the true system: dynamics, pictures, regions; measured is ``env.known_twin()``.
+        config: sizes and seed of the evaluation; sizes of grids that are 0 are those of ``env.system``.
+        kernel: true viability kernel of the twin; computed if not given.
+        draw: states -> frames ``(n, 3, H, W)`` uint8; default ``env.draw``. Another renderer measures how the agent
+            does on foreign frames.
+        episodes: number of episodes, in place of the configuration's.
+        grid: states per dimension of the state grid, in place of the configuration's.
+        progress: show progress bars.
+
+    Returns:
+        The measurements: sets on a grid, one-step errors, episodes, Lipschitz constants, latency.
+
+    Source: paper Section V shows figures only; the measurements are this library's.
+
+    Example:
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> sizes = EvaluationConfig(episodes=10, horizon=60, kernel_grid=51)
+        >>> found = evaluate(lambda pixels: torch.zeros(len(pixels)), PendulumEnv(), sizes)
+        >>> found["labelled_safe_rollouts_touch_unsafe"], found["volume_over_kernel"]
+        (1.0, None)
+    """
+    acts, config, twin = as_controller(agent), config or EvaluationConfig(), env.known_twin()
+    generator = torch.Generator().manual_seed(config.seed)
+    known = acts.agent if isinstance(acts, AgentController) and acts.driver is None else None
+    n, size = config.episodes if episodes is None else episodes, grid or config.grid
+    run = _Run(acts, known, twin, config, kernel, draw, n, size, progress, generator)  # type: ignore[arg-type]
+    run.kernel = kernel or viability_kernel(twin, resolution=run.sizes(twin.system.kernel_grid, config.kernel_grid))
+    safe_barrier = _sets(run)
+    if known is not None:
+        _lipschitz(run, known)
+        _random_errors(run, known)
+        _margins(run, known, safe_barrier)
+    _from_the_set(run)
+    _from_unsafe(run)
+    start = twin.sample_states(max(1, n // 5), generator=generator, region=twin.safe_set)
+    touched = twin.unsafe_set.contains(run.episodes(start, "S").states).any(0)
+    note = f"episodes of {config.horizon} steps from S"
+    run.out.add(share("labelled_safe_rollouts_touch_unsafe", int(touched.sum()), len(start), note))
+    run.out.add(latency(acts, twin))
+    return run.out
+
+
+def _sets(run: _Run) -> Tensor | None:
+    """The sets on a grid over the state space; returns the barrier values on samples of S."""
+    env, out, sizes = run.env, run.out, run.sizes(run.env.system.state_grid, run.grid)
+    states: Tensor = env.state_space.grid(sizes)  # type: ignore[attr-defined]
+    unsafe, viable = env.unsafe_set.contains(states), run.kernel.contains(states)
+    out.arrays.update(states=states, viability=run.kernel.interpolate(states), unsafe=unsafe)
+    latent = None if run.agent is None else encode_states(run.agent, env, states, draw=run.draw)
+    barrier = run.barrier(states) if run.agent is None else run.agent.barrier(latent)[:, 0]
+    safe_barrier = run.barrier(env.safe_set.sample(10000, generator=run.generator))
+    names = ("unsafe_called_safe", "safe_called_unsafe", "volume_over_kernel", "false_safe", "false_safe_of_doomed")
+    if barrier is None or safe_barrier is None:
+        out.missing(*names)
+        out.missing("worst_safe_barrier", "worst_unsafe_barrier", "barrier_depth", unit="barrier")
+        return None
+    member, doomed = barrier <= 0, ~unsafe & ~viable
+    on_grid = f"{sizes} states per dimension" if isinstance(sizes, int) else f"{_times(sizes)} states"
+    for name, events, of, note in (
+        (names[1], safe_barrier > 0, safe_barrier >= -math.inf, "uniform samples of S"),
+        (names[2], member & viable, viable, f"true kernel, {on_grid}"),
+        (names[3], member & ~viable, member, f"{{B<=0}} outside the true kernel, {on_grid}"),
+        (names[4], member & doomed, doomed, f"states outside U and the kernel, {on_grid}"),
+    ):
+        out.add(share(name, int(events.sum()), int(of.sum()), note))
+    note = "q1: largest B on S"
+    out.add(Measurement("worst_safe_barrier", float(safe_barrier.max()), "barrier", len(safe_barrier), note=note))
+    out.add(Measurement("barrier_depth", float(-barrier.min()), "barrier", note="|min B| on the grid"))
+    out.arrays.update(barrier=barrier, **({} if latent is None else {"latent": latent}))
+    in_unsafe, note = _unsafe_barrier(run, barrier[unsafe], on_grid)
+    out.add(share("unsafe_called_safe", int((in_unsafe <= 0).sum()), len(in_unsafe), note))
+    worst = float(-in_unsafe.min())
+    out.add(Measurement("worst_unsafe_barrier", worst, "barrier", len(in_unsafe), note="q2: largest -B on U"))
+    return safe_barrier
+
+
+def _times(sizes: Sequence[int]) -> str:
+    return " x ".join(str(k) for k in sizes)
+
+
+def _unsafe_barrier(run: _Run, on_state_grid: Tensor, on_grid: str) -> tuple[Tensor, str]:
+    """Barrier values on U: on the state grid, or on a grid of U's own where the system has one."""
+    env, own = run.env, run.env.system.unsafe_grid
+    if own is None:
+        return on_state_grid, f"grid of U, {on_grid}"
+    sizes: Any = run.sizes(own, run.grid)
+    bounds: Any = env.unsafe_set  # a region with the corners of the box around it
+    turns = env.state_space.period.tolist()  # type: ignore[attr-defined]
+    axes = [
+        torch.linspace(float(a), float(b), k + bool(turn))[:k]
+        for a, b, k, turn in zip(bounds.low, bounds.high, sizes, turns, strict=True)
+    ]
+    states = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
+    value = run.barrier(states[env.unsafe_set.contains(states)])
+    assert value is not None
+    return value, f"grid of {_times(sizes)} states over U"
+
+
+def _lipschitz(run: _Run, agent: Agent) -> None:
+    bound, add = agent.lipschitz_bound, run.out.add
+    lower = lipschitz_lower(agent.barrier, -1.0, 1.0, n=20000, generator=run.generator)
+    add(Measurement("lipschitz_certified", bound, "barrier / latent", note="proved for the deployed weights"))
+    add(Measurement("lipschitz_sampled", lower, "barrier / latent", 20000, note="largest gradient or secant found"))
+    add(Measurement("lipschitz_ratio", lower / bound, "ratio", note="sampled over certified"))
+
+
+def _random_errors(run: _Run, agent: Agent) -> None:
+    """Errors of the latent dynamics on single steps under random actions."""
+    env = run.env
+    start = env.sample_states(5000, generator=run.generator)
+    action = (2 * torch.rand(len(start), env.action_dim, generator=run.generator) - 1) * env.max_action
+    eyes, camera = AgentController(agent), Camera(run.draw or env.draw, start, env.previous_state(start))
+    z = eyes.watch(camera).latent
+    camera.move(env.wrap(env.dynamics(start, action)))
+    error = (agent.dynamics(z, action) - eyes.watch(camera).latent).norm(dim=-1)
+    quantiles(run.out, "random_action_error", error, "latent", "uniform states and actions")
+
+
+def _margins(run: _Run, agent: Agent, safe_barrier: Tensor | None) -> None:
+    """The paper's margins, and how far the conditions hold with them."""
+    env, out, latent, barrier = run.env, run.out, run.out.arrays["latent"], run.out.arrays["barrier"]
+    assert safe_barrier is not None
+    fresh = encode_states(agent, env, env.sample_states(5000, generator=run.generator), draw=run.draw)
+    nearest = torch.cat([torch.cdist(part, latent).amin(1) for part in fresh.split(CHUNK)])
+    note = f"fresh latents to the nearest of {len(latent)} latents of the grid; not a covering radius of all observations"
+    quantiles(out, "covering_radius", nearest, "latent", note)
+    error = _held_out_error(run, agent)
+    psi = functional.safety_margin(agent.lipschitz_bound, float(nearest.max()), mode="paper").q1
+    eta = functional.dynamics_margin(agent.lipschitz_bound, float(error.max()) if len(error) else math.nan)
+    out.add(Measurement("safety_margin", psi, "barrier", len(fresh), note="psi* = L_B eps-bar"))
+    out.add(Measurement("dynamics_margin", eta, "barrier", len(error), note="eta* = L_B delta, held-out steps of the policy"))
+    q3 = agent.barrier(agent.dynamics(latent, agent.policy(latent)))[:, 0][barrier <= 0]
+    for name, met, what in (
+        ("q1_with_margin", safe_barrier + psi <= 0, "B + psi* <= 0 on S"),
+        ("q2_with_margin", barrier[out.arrays["unsafe"]] - psi >= 0, "B - psi* >= 0 on U"),
+        ("q3_with_margin", q3 + psi + eta <= 0, "B(d(z, pi(z))) + psi* + eta* <= 0 on {B<=0}"),
+    ):
+        out.add(share(name, int(met.sum()), len(met), what))
+
+
+def _held_out_error(run: _Run, agent: Agent) -> Tensor:
+    """Errors of the latent dynamics on single steps of the policy from the set, ``(n,)``."""
+    env = run.env
+    start = states_where(run.inside, env.state_space, 5000, run.generator)
+    if not len(start):
+        return torch.zeros(0)
+    eyes, camera = AgentController(agent), Camera(run.draw or env.draw, start, env.previous_state(start))
+    first = eyes.step(camera)
+    assert first.action is not None
+    camera.move(env.wrap(env.dynamics(start, first.action)))
+    return (first.predicted - eyes.watch(camera).latent).norm(dim=-1)  # type: ignore[operator]
+
+
+def _from_the_set(run: _Run) -> None:
+    """Episodes from the learned safe set."""
+    env, out, horizon = run.env, run.out, run.config.horizon
+    start = states_where(run.inside, env.state_space, run.n, run.generator, draws=60 if "barrier" in out.arrays else 1)
+    note = f"episodes of {horizon} steps from {{B<=0}}"
+    if not len(start):
+        note = "{B<=0} is empty" if "barrier" in out.arrays else "no barrier"
+        for name in ("safe_rollouts_touch_unsafe", "safe_rollouts_leave"):
+            out.add(share(name, 0, 0, note))
+        out.missing("worst_next_barrier", unit="barrier", note=note)
+        return
+    found = run.episodes(start, "{B<=0}")
+    barrier = found.barrier
+    touched, left = env.unsafe_set.contains(found.states).any(0), (barrier > 0).any(0)
+    out.add(share("safe_rollouts_touch_unsafe", int(touched.sum()), len(start), note))
+    out.add(share("safe_rollouts_leave", int(left.sum()), len(start), note))
+    error, barrier_error = found.prediction_error, found.barrier_error
+    if error is not None and barrier_error is not None:
+        quantiles(out, "on_policy_error", error.amax(0), "latent", "largest error of an episode")
+        quantiles(out, "on_policy_step_error", error.flatten(), "latent", "error of a step")
+        what = "largest B(E(o')) - B(d(z,u)) of an episode"
+        quantiles(out, "barrier_error", barrier_error.amax(0), "barrier", what)
+    next_one = barrier[1][barrier[0] <= 0]
+    what = "R3: largest B after one step from {B<=0}"
+    out.add(Measurement("worst_next_barrier", float(next_one.max()), "barrier", len(next_one), note=what))
+    out.arrays.update(trajectories=found.states[:, :64], actions=found.actions[:, :64], traces=barrier[:, :64])
+
+
+def _from_unsafe(run: _Run) -> None:
+    """Episodes from U, where a return is possible at all."""
+    env, out = run.env, run.out
+    recoverable = recoverable_set(env, run.kernel)
+    start = states_where(
+        lambda x: env.unsafe_set.contains(x) & recoverable.contains(x), env.state_space, max(1, run.n // 5), run.generator
+    )
+    name, note = "unsafe_rollouts_return", "recoverable starts in U that end in {B<=0} and outside U"
+    if not len(start):
+        out.add(share(name, 0, 0, note))
+        return
+    found = run.episodes(start, "U")
+    if found.barrier is None:
+        home, note = run.kernel.contains(found.states[-1]), "recoverable starts in U that end in the true kernel (no barrier)"
+    else:
+        home = found.barrier[-1] <= 0
+        out.arrays.update(recovery_traces=found.barrier[:, :32])
+    back = home & ~env.unsafe_set.contains(found.states[-1])
+    out.add(share(name, int(back.sum()), len(start), note))
+    out.arrays.update(recovery=found.states[:, :32], recovery_actions=found.actions[:, :32])
+
+
+def latency(acts: Any, env: SafetyEnv, frames: int = 400) -> Measurement:
+    """Time from an observation to the action (and the barrier value), one after the other.
+
+    Args:
+        acts: see ``as_controller``; of an agent two frames to action and barrier value.
+        env: gives the pictures.
+        frames: how many.
+
+    Returns:
+        The 99th percentile in ms.
+
+    Source: none.
+    """
+    acts = as_controller(acts)
+    state = env.sample_states(20, torch.Generator().manual_seed(0))
+    seen = state if acts.reads == "state" else env.observe(state)
+    acts.reset()
+    ask = acts.agent.act if isinstance(acts, AgentController) else acts.step
+    seconds = []
+    for k in range(frames + 20):
+        start = time.perf_counter()
+        ask(seen[k % 20 : k % 20 + 1])
+        seconds.append(time.perf_counter() - start)
+    ordered = sorted(seconds[20:])
+    value = 1e3 * ordered[math.ceil(0.99 * frames) - 1]
+    what = "encoder, policy and barrier" if isinstance(acts, AgentController) else "whatever it does"
+    return Measurement("latency_p99", value, "ms", frames, note=f"{torch.get_num_threads()} thread(s), {what}")
+
+
+__all__ = ["barrier_of", "encode_states", "evaluate", "latency", "states_where"]

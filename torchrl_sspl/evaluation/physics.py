@@ -1,0 +1,143 @@
+"""Measurements in full physics: the system with a body, in a simulator with contacts and falls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.configs.schema import EvaluationConfig
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.evaluation.controllers import Controller, as_controller
+from torchrl_sspl.evaluation.known import barrier_of
+from torchrl_sspl.evaluation.measurements import Evaluation, share
+from torchrl_sspl.evaluation.simulation import Episodes, simulate
+
+_FROM_SAFE = ("walks_from_safe_hit", "walks_from_safe_fall")
+_FROM_SET = ("walks_from_set_enter", "walks_from_set_hit", "walks_from_set_fall")
+
+
+def evaluate_physics(
+    agent: Any, env: SafetyEnv, config: EvaluationConfig | None = None, *, progress: bool = False
+) -> tuple[Evaluation, list[Episodes]]:
+    """Measures an agent, or anything else that acts, in the full physics of a system.
+
+    Args:
+        agent: frozen agent, or what ``as_controller`` takes. Without a barrier no episode starts in {B <= 0}.
+        env: the system; ``env.physics()`` makes its world, ``env.known_twin()`` gives S, U, and the frames in which starts
+            inside {B <= 0} are looked for.
+        config: number (``walks``), length and seed of the episodes.
+        progress: show progress bars.
+
+    Returns:
+        Measurements (shares of episodes with exact bounds; in ``arrays["walks"]`` all episodes, first the closest call, with
+        its frames), and the episodes: those from S, then those from {B <= 0} where there are any.
+
+    Raises:
+        ConfigError: the system has no full physics.
+        MissingDependencyError: the simulator is not installed.
+
+    Source: none (the paper shows pictures).
+    """
+    acts, config, twin = as_controller(agent), config or EvaluationConfig(), env.known_twin()
+    out, n, groups = Evaluation(), config.walks, list[Episodes]()
+    starts = [("S", torch.zeros(0))] * 2
+    if n:
+        generator = torch.Generator().manual_seed(config.walk_seed)
+        starts = [("S", twin.safe_set.sample(n, generator)), ("{B <= 0}", _starts_inside(acts, twin, n, generator))]
+        world = _world(env)
+        try:
+            for where, start in starts:
+                options: dict[str, Any] = {"horizon": _steps(twin, config), "seed": config.walk_seed}
+                label = f"walks from {where}" if progress else None
+                if len(start):
+                    groups.append(simulate(acts, world, start=start, label=label, **options))
+            out.arrays["walks"] = _closest_on_film(acts, world, groups, options)
+        finally:
+            world.close()
+    length = f"walks of at most {config.walk_seconds:g} s from"
+    events = [dict.fromkeys(("hit", "entered", "fallen"), 0)] * 2
+    for k, group in enumerate(groups):
+        hit = group.events["hit"] | group.events["entered"] if k == 0 else group.events["hit"]
+        events[k] = {"hit": int(hit.sum())} | {name: int(group.events[name].sum()) for name in ("entered", "fallen")}
+    first, second = (len(start) for _, start in starts)
+    for name, event in zip(_FROM_SAFE, ("hit", "fallen"), strict=True):
+        out.add(share(name, events[0][event], first, f"{length} S, heading uniform"))
+    for name, event in zip(_FROM_SET, ("entered", "hit", "fallen"), strict=True):
+        out.add(share(name, events[1][event], second, f"{length} {{B <= 0}} outside U"))
+    return out, groups
+
+
+def filmed_episode(
+    agent: Any, env: SafetyEnv, start: Tensor, config: EvaluationConfig | None = None, *, seed: int = 0
+) -> Episodes:
+    """One episode in the full physics of a system, with its frames.
+
+    Args:
+        agent: see :func:`evaluate_physics`.
+        env: the system; ``env.physics()`` makes its world.
+        start: ``(s,)`` the pose in which it starts.
+        config: length of the episode.
+        seed: of what the world draws at the start.
+
+    Returns:
+        The episode.
+
+    Raises:
+        ConfigError: the system has no full physics.
+        MissingDependencyError: the simulator is not installed.
+
+    Source: none.
+    """
+    world = _world(env)
+    try:
+        steps = _steps(env, config or EvaluationConfig())
+        return simulate(agent, world, start=torch.as_tensor(start)[None], horizon=steps, seed=seed, film=1)
+    finally:
+        world.close()
+
+
+def _world(env: SafetyEnv) -> Any:
+    make = env.physics()
+    if make is None:
+        raise ConfigError(
+            f"physics: expected a system with a full physics, received {type(env).__name__}, which has none; override physics()"
+        )
+    return make()
+
+
+def _steps(env: SafetyEnv, config: EvaluationConfig) -> int:
+    return max(1, round(config.walk_seconds / env.dt))  # type: ignore[operator]
+
+
+def _closest_on_film(acts: Controller, world: Any, groups: list[Episodes], options: dict[str, Any]) -> Episodes:
+    """All episodes; first the one whose barrier came highest (without a barrier just the first), once more and filmed."""
+    every, lengths = groups[0].joined(*groups[1:]), [len(group) for group in groups]
+    chosen = 0
+    if every.barrier is not None:
+        chosen = int(torch.where(every.alive, every.barrier, -torch.inf).amax(0).argmax())
+    number = chosen if chosen < lengths[0] else chosen - lengths[0]  # each group counts its seeds anew
+    start = every.states[0, chosen][None]
+    again = simulate(acts, world, start=start, film=1, **(options | {"seed": options["seed"] + number}))
+    rest = torch.arange(len(every)) != chosen
+    return again.joined(every.select(rest)) if bool(rest.any()) else again
+
+
+def _starts_inside(acts: Controller, twin: SafetyEnv, n: int, generator: torch.Generator) -> Tensor:
+    """Up to n uniform states outside U with B <= 0."""
+    outside_unsafe = twin.state_space - twin.unsafe_set
+    found = torch.zeros(0, twin.state_dim)
+    for _ in range(20):
+        states = outside_unsafe.sample(max(4 * n, 200), generator)
+        value = barrier_of(acts, twin, states)
+        if value is None:
+            break
+        found = torch.cat([found, states[value <= 0]])
+        if len(found) >= n:
+            break
+    return found[:n]
+
+
+__all__ = ["evaluate_physics", "filmed_episode"]

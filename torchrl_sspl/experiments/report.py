@@ -1,0 +1,279 @@
+"""The report of a run, of whatever system: figures that apply to what was measured, a film, and one page."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_sspl.certification.certificate import Certificate
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import CheckpointError
+from torchrl_sspl.evaluation.outcome import Outcome
+from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.sets import SAFE, UNSAFE
+from torchrl_sspl.trainers.loggers import encode_gif
+from torchrl_sspl.viz.animation import animate
+from torchrl_sspl.viz.certificate import certificate_section, proved_lines
+from torchrl_sspl.viz.curves import training_curves
+from torchrl_sspl.viz.figures import frames, latent_space, state_plane, trajectories
+from torchrl_sspl.viz.plane import Plane, new_figure
+from torchrl_sspl.viz.report import requirement_rows, write_report
+from torchrl_sspl.viz.slices import slices, walks
+
+REPORT_FILE = "report.html"
+_SHOWN = 40  # episodes whose barrier is drawn
+_POINTS = 20_000  # latents of a grid that are looked at
+_FILM_SIZE, _FILM_STEPS = 240, 120  # pixels, at least; steps, at most
+_ASSUMED = (
+    "The environment, its pictures and its resets stay as they were during the evaluation.",
+    "Episodes are independent; observations within one are not, and carry no bound.",
+)
+_UNKNOWN = (
+    "No model of the environment is known: every figure counts fresh episodes from its own resets. Nothing is said about "
+    "states that these do not reach."
+)
+
+
+def write_run_report(outcome: Outcome, env: SafetyEnv | None, *, title: str | None = None) -> dict[str, Any]:
+    """Draw the figures and the film of a run, and write ``report.html`` with all of them.
+
+    What is drawn follows from what was measured and from ``env.system``: nothing here knows a system by name.
+
+    Args:
+        outcome: of the run; its ``report`` is set.
+        env: the system, as it was trained on; None where it is known by being run only.
+        title: title of the page; by default the system's.
+
+    Returns:
+        Matplotlib figures by title; they are in ``figures/`` of the run too.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Section V (figures); deviation: the true kernel, measurements and verdicts are added.
+    """
+    folder = Path(outcome.directory) / "figures"
+    folder.mkdir(parents=True, exist_ok=True)
+    figures = draw_figures(outcome, env)
+    for name, figure in figures.items():
+        figure.savefig(folder / f"{name.lower().replace(' ', '_')}.png", dpi=130)
+    film, caption = _film(outcome, env, folder)
+    requirements = () if env is None else env.system.requirements
+    rows: list[Any] = []
+    measurements: dict[str, Any] = {}
+    for name, evaluation in outcome.evaluations.items():
+        own = name == "own"
+        found = requirement_rows([r for r in requirements if own or r.name in evaluation.measurements], evaluation)
+        rows += [(row[0] if own else f"{row[0]} ({name} frames)", *row[1:]) for row in found]
+        measurements |= {k if own else f"{name} frames: {k}": m for k, m in evaluation.measurements.items()}
+    config = {k: v for k, v in outcome.config.to_dict().items() if k != "out_dir" and v not in (None, {})}
+    certificate = outcome.certificate
+    outcome.report = write_report(
+        Path(outcome.directory) / REPORT_FILE,
+        title=title or ("Safe policy from pixels" if env is None else env.system.title),
+        summary=rows,
+        measurements=measurements,
+        figures=figures,
+        config=config,
+        checks=outcome.checks,
+        video=film,
+        video_caption=caption,
+        notes="\n\n".join(_notes(outcome, env)),
+        headline=_headline(certificate),
+        measured=outcome.measured(),
+        proved=_proved(outcome),
+        assumed=_ASSUMED if env is None else None,
+        certificate=None if certificate is None else certificate_section(certificate),
+    )
+    return figures
+
+
+def draw_figures(outcome: Outcome, env: SafetyEnv | None) -> dict[str, Any]:
+    """Figures of everything that an evaluation has left.
+
+    Args:
+        outcome: of the run.
+        env: the system, as it was trained on; None where it is known by being run only.
+
+    Returns:
+        Matplotlib figures by title.
+
+    Raises:
+        MissingDependencyError: matplotlib is not installed.
+
+    Source: paper Section V; deviation: see the figures.
+    """
+    arrays, barrier = outcome.evaluations["own"].arrays, getattr(outcome.agent, "barrier", None)
+    figures = _of_episodes(arrays, barrier) if env is None else _of_states(arrays, barrier, env)
+    log = Path(outcome.directory) / "log.jsonl"
+    if log.is_file():
+        with contextlib.suppress(CheckpointError):  # nothing was trained, or not long enough for a line
+            figures["Training"] = training_curves(log)
+    return figures
+
+
+def _of_states(arrays: dict[str, Any], barrier: Any, env: SafetyEnv) -> dict[str, Any]:
+    """Figures of a system whose states and true kernel are known."""
+    twin, system = env.known_twin(), env.system
+    figures: dict[str, Any] = {}
+    plane = _plane(twin) if twin.state_dim > 1 else None
+    background = (arrays["states"], arrays["barrier"]) if arrays.get("barrier") is not None else None
+    if background is not None:
+        if plane is not None:
+            figures["State plane"] = _learned_set(plane, twin, *background, arrays["viability"].clamp(-10.0, 10.0))
+        some = slice(None, None, max(1, len(arrays["states"]) // _POINTS))
+        if arrays.get("latent") is not None and arrays["latent"].shape[1] >= 2:
+            figures["Latent space"] = latent_space(arrays["latent"][some], twin.region(arrays["states"][some]), barrier)
+    # Called ``traces`` for the barrier values along ``trajectories``, and so for the ways back.
+    for name, prefix, where in (("From the safe set", "", "{B <= 0}"), ("Back from U", "recovery_", "U")):
+        paths = arrays.get("recovery" if prefix else "trajectories")
+        if plane is None or paths is None:
+            continue
+        chosen, lengths = _shown_of(twin, paths)
+        trace = arrays.get(f"{prefix}traces")
+        figures[name] = trajectories(
+            plane,
+            paths[:, chosen],
+            arrays[f"{prefix}actions"][:, chosen],
+            None if trace is None else trace[:, chosen],
+            background=background,
+            action_name=system.action_name,
+            action_direction=system.action_direction,
+            dt=getattr(twin, "dt", None),
+            lengths=lengths,
+            caption=f"Episodes that start in {where}" + ("." if lengths is None else ", of the longer half; they end where the space does."),
+        )
+    episodes = arrays.get("walks")
+    if plane is not None and episodes is not None and episodes.states is not None:
+        wrong = torch.stack([happened for name, happened in episodes.events.items() if name != "left"]).any(0)
+        figures["Walks in full physics"] = walks(plane, episodes.states, episodes.alive, wrong)
+    generator = torch.Generator().manual_seed(0)
+    regions = (env.safe_set, env.state_space, env.unsafe_set)
+    figures["What the agent sees"] = frames(env, torch.cat([env.sample_states(2, generator, region=r) for r in regions]))
+    return figures
+
+
+def _plane(twin: SafetyEnv) -> Plane:
+    first, second = twin.system.state_names[:2]
+    return Plane.of(twin, (first, second))
+
+
+def _learned_set(plane: Plane, twin: SafetyEnv, states: Any, barrier: Any, viability: Any) -> Any:
+    """The learned set and the true kernel: in the plane, for several values of a third coordinate where that is an angle."""
+    if twin.state_dim != 3 or not math.isclose(plane.period[2], 2 * math.pi, rel_tol=1e-4):
+        return state_plane(plane, states, barrier, viable=viability)
+    units = [name.partition("[")[2] for name in plane.names]
+    names = twin.system.state_names
+    return slices(plane, states, barrier, viability, name=names[2], arrows=bool(units[0]) and units[0] == units[1])
+
+
+def _shown_of(twin: SafetyEnv, paths: Any) -> tuple[Any, Any]:
+    """Which episodes are shown, and how many steps of each: where leaving is safe, the longer half, up to the last step
+    inside."""
+    if twin.exit_region != SAFE:
+        return slice(None), None
+    inside = twin.state_space.contains(paths).sum(0)
+    longest = inside.argsort(descending=True)[: max(1, len(inside) // 2)]
+    return longest, inside[longest] - 1
+
+
+def _of_episodes(arrays: dict[str, Any], barrier: Any) -> dict[str, Any]:
+    """Figures of a system that is known by being run only."""
+    own, chance = arrays["own"], arrays["chance"]
+    figures: dict[str, Any] = {}
+    both = own.joined(chance)
+    if both.latent is not None and both.latent.shape[-1] >= 2:
+        figures["Latent space"] = latent_space(both.latent[both.alive], both.region[both.alive], barrier)
+    if both.barrier is None:
+        return figures
+    figure = new_figure(8, 3.6, "Barrier value along fresh episodes; a dot marks an observation of U.")
+    for k, (name, episodes) in enumerate((("under the policy", own), ("under random actions", chance))):
+        axes = figure.add_subplot(1, 2, k + 1)
+        value = torch.where(episodes.alive, episodes.barrier, math.nan)[:, :_SHOWN]
+        axes.plot(value, color="C0", linewidth=0.7, alpha=0.5)
+        step, episode = ((episodes.region == UNSAFE) & episodes.alive)[:, :_SHOWN].nonzero(as_tuple=True)
+        axes.plot(step, value[step, episode], ".", color="C3", markersize=3)
+        axes.axhline(0, color="black", linewidth=1)
+        axes.set(title=name, xlabel="step", ylabel="B")
+    figures["Barrier along episodes"] = figure
+    return figures
+
+
+def _film(outcome: Outcome, env: SafetyEnv | None, folder: Path) -> tuple[Path | None, str]:
+    """Film of one episode and what it shows: in full physics, on the true dynamics, or as the agent sees it."""
+    arrays = outcome.evaluations["own"].arrays
+    if env is None:
+        return _seen(arrays["own"], folder / "episode.gif"), "One episode, as the agent sees it."
+    twin = env.known_twin()
+    in_physics = arrays.get("walks")
+    if in_physics is not None and in_physics.frames is not None:
+        episodes, text = in_physics, "The closest call in full physics"
+    elif arrays.get("recovery") is not None and arrays["recovery"].shape[1]:
+        start, steps = arrays["recovery"][0, :1], min(len(arrays["recovery"]) - 1, _FILM_STEPS)
+        episodes, text = simulate(outcome.agent, twin, start=start, horizon=steps, film=1), "From U back into the safe set"
+    else:
+        return None, ""
+    if twin.state_dim < 2:
+        return _seen(episodes, folder / "episode.gif"), f"{text}, as the agent sees it."
+    last = max(2, int(episodes.alive[:, 0].sum()))
+    path = animate(
+        episodes.states[:last, 0],  # type: ignore[index]
+        episodes.frames[:last, 0],  # type: ignore[index]
+        None if episodes.barrier is None else episodes.barrier[:last, 0],
+        episodes.actions[: last - 1, 0],
+        folder / "episode.mp4",
+        plane=_plane(twin),
+        background=(arrays["states"], arrays["barrier"]) if arrays.get("barrier") is not None else None,
+        action_name=env.system.action_name,
+        fps=max(1, round(1 / getattr(env, "dt", 0.05))),
+        title=text,
+    )
+    return path, f"{text}: what the agent sees, the true state, and the barrier value."
+
+
+def _seen(episodes: Episodes, path: Path) -> Path | None:
+    """Film of what the first episode shows, large enough to be looked at."""
+    if episodes.frames is None:
+        return None
+    pictures = episodes.frames[episodes.alive[:, 0], 0]
+    larger = max(1, _FILM_SIZE // pictures.shape[-1])
+    path.write_bytes(encode_gif(pictures.repeat_interleave(larger, -1).repeat_interleave(larger, -2)))
+    return path
+
+
+def _notes(outcome: Outcome, env: SafetyEnv | None) -> list[str]:
+    lines = [f"Warning: {text}." for text in outcome.warnings] + [f"To try: {text}." for text in outcome.advice]
+    if outcome.seconds is not None:
+        lines.append(f"Training took {outcome.seconds:.0f} s" + (f"; {outcome.stop_reason}." if outcome.stop_reason else "."))
+    if outcome.budget:
+        lines.append("What it was trained on: " + ", ".join(f"{n:,} {what}" for what, n in outcome.budget.items()) + ".")
+    return [*lines, *((_UNKNOWN,) if env is None else env.system.notes)]
+
+
+def _proved(outcome: Outcome) -> list[str]:
+    """What the certificate proves; without one, what the agent's own proof says."""
+    if outcome.certificate is not None:
+        return proved_lines(outcome.certificate)
+    if not getattr(outcome.agent, "description", {}).get("lipschitz", {}).get("proved"):
+        return []
+    bound = f"{outcome.agent.lipschitz_bound:g}"
+    return [f"The deployed float32 barrier is {bound}-Lipschitz on all of its domain (exact integer arithmetic)."]
+
+
+def _headline(certificate: Certificate | None) -> tuple[str, str]:
+    """What the certificate says, in a line."""
+    if certificate is None:
+        return "Measured, without a certificate", "none"
+    for name in ("deterministic", "statistical"):
+        layer = certificate.layers.get(name)
+        if layer is not None and not layer.holds:
+            return f"{name.capitalize()} layer {layer.verdict}", "bad"
+    measured = "statistical" in certificate.layers
+    return ("Certified: proved and measured", "good") if measured else ("Proved, and not measured", "fair")
+
+
+__all__ = ["REPORT_FILE", "draw_figures", "write_run_report"]

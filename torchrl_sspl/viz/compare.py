@@ -1,0 +1,400 @@
+"""Runs beside each other: one table over their measurements, and one page with settings, figures and curves."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+from torchrl_sspl.configs.reader import EnvFactory
+from torchrl_sspl.envs.system import Requirement
+from torchrl_sspl.errors import CheckpointError
+from torchrl_sspl.viz.curves import read_log
+from torchrl_sspl.viz.report import badge, format_value, table
+from torchrl_sspl.viz.report_style import CSS
+
+COLOURS = ("#2166ac", "#b2182b", "#1b7837", "#b35806", "#762a83", "#01665e", "#c51b7d", "#4d4d4d")
+_OWN = ("out_dir", "seed", "trainer.progress", "logger.kind", "logger.project")  # no settings of what is compared
+_CSS = """
+.side{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(380px,100%),1fr));gap:14px}.side figure{margin:0}
+.side.small{grid-template-columns:repeat(auto-fill,minmax(230px,1fr))}
+main{max-width:1200px}.curve{width:100%;height:auto}.curve text{font-size:11px;fill:var(--soft)}.curve line{stroke:var(--line)}
+.key i{display:inline-block;width:1em;height:.25em;margin:0 .4em .2em 1em}
+"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run on disk.
+
+    Attributes:
+        name: what tells it from the others.
+        directory: where it lies.
+        metrics: what its ``metrics.json`` says; of a run that has not come to an end, its configuration alone.
+    """
+
+    name: str
+    directory: Path
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def finished(self) -> bool:
+        """Whether it was evaluated."""
+        return "measurements" in self.metrics
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Values by key."""
+        config = self.metrics.get("config", {})
+        inner = {f"{s}.{k}": v for s, section in config.items() if isinstance(section, Mapping) for k, v in section.items()}
+        return {k: v for k, v in config.items() if not isinstance(v, Mapping)} | inner
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measurement over the runs of one setting, which differ in their seeds.
+
+    Attributes:
+        setting: what tells the setting from others, such as "synthesis.margin=0.05".
+        evaluation: where it was measured.
+        name: of the measurement.
+        label: what it is, for people.
+        unit: of the values.
+        must: limit of the requirement such as "<= 0.01", or "".
+        mean: over the runs that measured it.
+        worst: of these, by the sense of the requirement; None without one.
+        values: by run; None where it was not measured.
+        verdict: of the worst run, "not measured" if a run is missing, or "" without a requirement.
+    """
+
+    setting: str
+    evaluation: str
+    name: str
+    label: str
+    unit: str
+    must: str
+    mean: float | None
+    worst: float | None
+    values: dict[str, float | None]
+    verdict: str
+
+
+def read_runs(directories: Sequence[str | Path]) -> list[Run]:
+    """Runs of these directories, named by what their paths do not share.
+
+    Args:
+        directories: of runs; those without ``metrics.json`` count as not finished.
+
+    Returns:
+        The runs.
+
+    Raises:
+        CheckpointError: if there is no such directory, or its ``metrics.json`` cannot be read.
+
+    Source: none.
+    """
+    paths = [Path(d) for d in directories]
+    shared = os.path.commonpath([p.resolve().parent for p in paths]) if paths else ""
+    return [Run(os.path.relpath(path.resolve(), shared), path, read_metrics(path)) for path in paths]
+
+
+def read_metrics(directory: Path) -> dict[str, Any]:
+    """What a run's directory says about it; arguments and errors as for :func:`read_runs`."""
+    if not directory.is_dir():
+        raise CheckpointError(f"expected the directory of a run, received '{directory}'; train one with `sspl train`")
+    for name, key in (("metrics.json", None), ("config.json", "config")):
+        if (file := directory / name).is_file():
+            try:
+                body = dict(json.loads(file.read_text()))
+            except (ValueError, TypeError) as error:
+                raise CheckpointError(f"expected readable numbers in '{file}', received {error}; run it again") from error
+            return {key: body} if key else body
+    return {}
+
+
+def differing(runs: Sequence[Run]) -> list[str]:
+    """Keys in which the settings of runs differ, apart from seed and directory.
+
+    Args:
+        runs: the runs.
+
+    Returns:
+        The keys.
+
+    Source: none.
+    """
+    settings = [run.settings for run in runs if run.metrics]
+    keys = dict.fromkeys(k for s in settings for k in s)
+    return [k for k in keys if k not in _OWN and any(s.get(k) != settings[0].get(k) for s in settings)]
+
+
+def rows_of(runs: Sequence[Run]) -> list[Row]:
+    """The table over runs: what is required first, then whatever else was measured.
+
+    Args:
+        runs: the runs.
+
+    Returns:
+        A row for every setting, evaluation and measurement.
+
+    Source: none.
+    """
+    keys = differing(runs)
+    groups: dict[str, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(", ".join(f"{k}={_show(run.settings.get(k))}" for k in keys), []).append(run)
+    rows = []
+    for setting, members in groups.items():
+        if len(keys) > 4:  # the page has a table of what differs
+            setting = f"{members[0].name} ({len(keys)} settings differ)"
+        required = {r.name: r for r in _requirements(next((m for m in members if m.finished), members[0]))}
+        pairs = list(dict.fromkeys((n, e) for run in members for e, found in _measured(run).items() for n in found))
+        pairs += [(n, "") for n in required if all(n != name for name, _ in pairs)]
+        order = [*required, *(n for n, _ in pairs)]
+        for name, evaluation in sorted(pairs, key=lambda pair: order.index(pair[0])):
+            shown = f" ({evaluation})" if sum(n == name for n, _ in pairs) > 1 else ""
+            rows.append(_row(setting, evaluation, name, shown, members, required.get(name)))
+    return rows
+
+
+def _row(setting: str, evaluation: str, name: str, shown: str, runs: Sequence[Run], required: Requirement | None) -> Row:
+    found = [_measured(run).get(evaluation, {}).get(name, {}) for run in runs]
+    values = {run.name: _number(m.get("value")) for run, m in zip(runs, found, strict=True)}
+    known = [v for v in values.values() if v is not None]
+    mean = sum(known) / len(known) if known else None
+    unit = next((m["unit"] for m in found if m.get("unit")), "share" if required and max(required.must, required.aim) <= 1 else "")
+    if required is None:
+        return Row(setting, evaluation, name, name + shown, unit, "", mean, None, values, "")
+    worst = (max if required.sense == "<=" else min)(known, default=None)
+    asked = worst if len(known) == len(values) else None
+    verdict = required.verdict(SimpleNamespace(measurements={name: SimpleNamespace(value=asked)}))
+    if unit == "share" and verdict.startswith("missed by "):
+        verdict = f"missed by {format_value(float(verdict.removeprefix('missed by ')), unit)}"
+    must = f"{required.sense} {format_value(required.must, unit)}"
+    return Row(setting, evaluation, name, required.label + shown, unit, must, mean, worst, values, verdict)
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if isinstance(value, (int, float)) and not math.isnan(value) else None
+
+
+def _measured(run: Run) -> Mapping[str, Any]:
+    return run.metrics.get("measurements", {})
+
+
+def _requirements(run: Run) -> Sequence[Requirement]:
+    """Requirements of the system of a run: as its metrics say, or its environment."""
+    if "requirements" in run.metrics:
+        return [Requirement(**r) for r in run.metrics["requirements"]]
+    try:
+        env = EnvFactory(run.metrics["config"]["env"])(batch_size=[1], seed=0)
+    except Exception:  # given in code, or not to be had here
+        return ()
+    requirements = getattr(getattr(env, "system", None), "requirements", ())
+    env.close()
+    return requirements
+
+
+def _show(value: Any) -> str:
+    return "null" if value is None else str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def text_table(rows: Sequence[Row]) -> str:
+    """Rows with a requirement as text, a block for every setting.
+
+    Args:
+        rows: see :func:`rows_of`; without any requirement all of them are shown.
+
+    Returns:
+        The text.
+
+    Source: none.
+    """
+    rows = [r for r in rows if r.must] or list(rows)
+    lines: list[str] = []
+    for setting in dict.fromkeys(r.setting for r in rows):
+        block = [r for r in rows if r.setting == setting]
+        names = list(dict.fromkeys(n for r in block for n in r.values))
+        head = ["", "must", "mean", "worst", "verdict", *names]
+        body = [[*(_cells(r)), *(format_value(r.values.get(n), r.unit) if r.values.get(n) is not None else "-" for n in names)] for r in block]
+        widths = [max(len(line[i]) for line in [head, *body]) for i in range(len(head))]
+        lines += [setting] if setting else []
+        lines += ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in [head, *body]] + [""]
+    return "\n".join(lines).rstrip()
+
+
+def _cells(row: Row) -> list[str]:
+    worst = "" if row.worst is None else format_value(row.worst, row.unit)
+    return [row.label, row.must, format_value(row.mean, row.unit), worst, row.verdict]
+
+
+def compare(runs: Sequence[str | Path] | Sequence[Run], path: str | Path, *, title: str = "") -> Path:
+    """Write a page that shows runs beside each other; self-contained, without scripts.
+
+    Args:
+        runs: directories of runs, or runs that were read.
+        path: file to write; its folder is created.
+        title: of the page.
+
+    Returns:
+        The file.
+
+    Raises:
+        CheckpointError: if there is no run, or one of them cannot be read.
+
+    Source: none.
+    """
+    found = [r for r in runs if isinstance(r, Run)] or read_runs([r for r in runs if not isinstance(r, Run)])
+    if not any(run.finished for run in found):
+        raise CheckpointError(f"expected at least one run with metrics.json, received {len(found)} directories without")
+    rows, title = rows_of(found), title or f"{len(found)} runs"
+    required = [r for r in rows if r.must]
+    parts = [
+        ("Runs", _overview(found)),
+        ("Settings that differ", _settings(found, differing(found))),
+        ("Requirements", _side(required) + _table(required)),
+        ("Figures", _figures(found)),
+        ("Curves", _curves(found)),
+        ("", f"<details><summary>All measurements</summary>{_table(rows)}</details>"),
+        ("", f"<details><summary>All settings</summary>{_settings(found, list(dict.fromkeys(k for run in found for k in run.settings)))}</details>"),
+    ]
+    body = "".join(f"<section>{f'<h2>{name}</h2>' if name else ''}{text}</section>" for name, text in parts if text)
+    page = (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">'
+        f"<title>{escape(title)}</title><style>{CSS}{_CSS}</style></head><body><main><header><h1>{escape(title)}</h1>"
+        f"<p class='facts'>{len(differing(found))} settings differ, apart from the seed</p></header>{body}</main></body></html>\n"
+    )
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    part.write_text(page, encoding="utf-8")
+    return part.replace(path)
+
+
+def _overview(runs: Sequence[Run]) -> str:
+    cells = []
+    for run in runs:
+        m, verdicts = run.metrics, list(run.metrics.get("verdicts", {}).values())
+        missed = sum(not str(v).startswith(("aim", "must")) for v in verdicts)
+        verdict = "not measured" if not verdicts else f"missed {missed} of {len(verdicts)}" if missed else "must"
+        seconds = m.get("training_seconds")
+        cells.append([
+            f"<code>{escape(run.name)}</code>", escape(_show(run.settings.get("seed"))),
+            "" if seconds is None else f"{seconds / 60:.1f} min",
+            escape(str(m.get("stop_reason", "") if run.finished else "not finished")), badge(verdict),
+        ])  # fmt: skip
+    return table(["Run", "Seed", "Training", "Why it ended", "Requirements"], cells, kind="plain")
+
+
+def _table(rows: Sequence[Row]) -> str:
+    out = []
+    for setting in dict.fromkeys(r.setting for r in rows):
+        block = [r for r in rows if r.setting == setting]
+        names = list(dict.fromkeys(n for r in block for n in r.values))
+        cells = []
+        for r in block:
+            label, must, mean, worst, verdict = (escape(c) for c in _cells(r))
+            each = [escape(format_value(r.values[n], r.unit)) if n in r.values else "" for n in names]
+            cells.append([label, must, mean, f"<b>{worst}</b>", badge(verdict) if r.must else "", *each])
+        out += [f"<h3>{escape(setting)}</h3>"] if setting else []
+        out.append(table(["Measurement", "Must", "Mean", "Worst", "Verdict of the worst", *names], cells, kind="plain"))
+    return "".join(out)
+
+
+def _side(rows: Sequence[Row]) -> str:
+    """The settings beside each other: worst with its verdict, and mean."""
+    settings = list(dict.fromkeys(r.setting for r in rows))
+    if len(settings) < 2:
+        return ""
+    places: dict[str, dict[str, Row]] = {}
+    for r in rows:
+        places.setdefault(r.label, {})[r.setting] = r
+    cells = []
+    for label, found in places.items():
+        text = {s: f"<b>{escape(_cells(r)[3])}</b> {badge(r.verdict)}<br>mean {escape(_cells(r)[2])}" for s, r in found.items()}
+        must = next((r.must for r in found.values() if r.mean is not None), next(iter(found.values())).must)
+        cells.append([escape(label), escape(must), *(text.get(s, "") for s in settings)])
+    return table(["Worst, verdict and mean", "Must", *settings], cells, kind="plain")
+
+
+def _settings(runs: Sequence[Run], keys: Sequence[str]) -> str:
+    cells = [[f"<code>{escape(k)}</code>", *(escape(_show(run.settings.get(k))) for run in runs)] for k in keys]
+    return table(["Key", *(run.name for run in runs)], cells, kind="plain") if keys else ""
+
+
+def _figures(runs: Sequence[Run]) -> str:
+    from torchrl_sspl.viz.report import _file_uri
+
+    files = {run.name: {p.name: p for p in sorted((run.directory / "figures").glob("*.png"))} for run in runs}
+    out = []
+    for name in dict.fromkeys(n for found in files.values() for n in found):
+        shown = [
+            f'<figure><img alt="{escape(name)}" src="{_file_uri(files[run.name][name])[0]}">'
+            f"<figcaption>{escape(run.name)}</figcaption></figure>"
+            for run in runs
+            if name in files[run.name]
+        ]
+        out.append(f"<h3>{escape(Path(name).stem.replace('_', ' '))}</h3><div class='side'>{''.join(shown)}</div>")
+    return "".join(out)
+
+
+def _curves(runs: Sequence[Run]) -> str:
+    """Every loss of every phase over its steps, one line per run."""
+    panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for run in runs:
+        for title, point in _points(run):
+            panels.setdefault(title, {}).setdefault(run.name, []).append(point)
+    if not panels:
+        return ""
+    colour = {run.name: COLOURS[i % len(COLOURS)] for i, run in enumerate(runs)}
+    key = "".join(f'<i style="background:{c}"></i>{escape(n)}' for n, c in colour.items())
+    drawn = "".join(_panel(title, lines, colour) for title, lines in panels.items())
+    return f"<p class='key'>{key}</p><div class='side small'>{drawn}</div>"
+
+
+def _points(run: Run) -> Iterator[tuple[str, tuple[float, float]]]:
+    try:
+        log = read_log(run.directory / "log.jsonl")
+    except CheckpointError:
+        return
+    longest: dict[str, int] = {}
+    for row in log:
+        longest[row["phase"]] = max(longest.get(row["phase"], 1), row["step"])
+    for row in log:  # rounds follow each other on the axis
+        x = row["round"] * longest[row["phase"]] + row["step"]
+        for name, value in row.items():
+            if name.startswith("loss") and isinstance(value, (int, float)) and math.isfinite(value):
+                yield f"{row['phase']}: {name.removeprefix('loss_').replace('_', ' ')}", (float(x), float(value))
+
+
+def _panel(title: str, lines: Mapping[str, list[tuple[float, float]]], colour: Mapping[str, str]) -> str:
+    points = [p for line in lines.values() for p in line]
+    log = min(y for _, y in points) > 0
+
+    def height(y: float) -> float:
+        return math.log10(y) if log else y
+
+    left, right = min(x for x, _ in points), max(x for x, _ in points)
+    low, high = height(min(y for _, y in points)), height(max(y for _, y in points))
+
+    def place(x: float, y: float) -> str:
+        return f"{40 + 250 * (x - left) / ((right - left) or 1):.1f},{130 - 110 * (height(y) - low) / ((high - low) or 1):.1f}"
+
+    drawn = "".join(
+        f'<polyline fill="none" stroke-width="1.5" stroke="{colour[name]}" points="{" ".join(place(*p) for p in line[:: len(line) // 400 + 1])}"/>'
+        for name, line in lines.items()
+    )
+    ends = [10**v if log else v for v in (low, high)]
+    text = f'<text x="0" y="134">{ends[0]:.2g}</text><text x="0" y="24">{ends[1]:.2g}</text><text x="265" y="148">{right:g}</text>'
+    axes = '<line x1="40" y1="130" x2="290" y2="130"/><line x1="40" y1="20" x2="40" y2="130"/>'
+    return f'<svg class="curve" viewBox="0 0 300 152" role="img"><text x="40" y="12">{escape(title)}</text>{axes}{text}{drawn}</svg>'
+
+
+__all__ = ["Row", "Run", "compare", "differing", "read_runs", "rows_of", "text_table"]
