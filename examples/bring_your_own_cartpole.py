@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from torchrl_sspl.envs import GymnasiumPixels
-from torchrl_sspl.trainers.experiment import run_experiment
+from torchrl_sspl.experiments.run import run_experiment
 
 
 class OnTheCart(gymnasium.Wrapper):  # the camera rides on the cart: pole and rate fill the picture

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from torchrl_sspl.envs import GymnasiumPixels
-from torchrl_sspl.trainers.experiment import run_experiment
+from torchrl_sspl.experiments.run import run_experiment
 
 
 def make():  # what it renders also shows the action, as a cross; what it observes does not

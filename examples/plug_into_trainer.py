@@ -1,59 +1,62 @@
-"""SSPLLoss in TorchRL's own Trainer, or with --loop in a loop of your own."""
+"""SSPLLoss in TorchRL's own Trainer, or with --loop in a loop of your own; then the library's phases, and its measures."""
 
 import sys
+from functools import partial
 
 import torch
 from torchrl.collectors import Collector
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
-from torchrl.objectives import SoftUpdate
-from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer
+from torchrl.trainers import ReplayBufferTrainer, Trainer
 
+from torchrl_sspl import Agent, evaluate
+from torchrl_sspl.configs import compose
+from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.modules import Policy, SaLaD, make_rollout_policy
+from torchrl_sspl.lipschitz import SandwichBarrier
+from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, SaLaD, make_rollout_policy
 from torchrl_sspl.objectives import SSPLLoss
+from torchrl_sspl.trainers import CheckRound, Phases, Source, Workspace, starts_of, synthesis_phases
+
+SHOWN = ("unsafe_called_safe", "safe_called_unsafe", "volume_over_kernel", "false_safe", "safe_rollouts_touch_unsafe",
+         "safe_rollouts_leave", "unsafe_rollouts_return")  # fmt: skip
 
 
-def total(terms):
-    return sum(value for key, value in terms.items() if key.startswith("loss_"))
-
-
-def main(batches: int = 12, updates: int = 32, seed: int = 0, loop: bool = False) -> dict[str, float]:
+def main(*overrides: str, batches: int = 19, updates: int = 400, loop: bool = False, phases: bool = True, seed: int = 0):
+    config = compose(["env=pendulum", *overrides])  # for the settings of phases and evaluation
     torch.manual_seed(seed)
-    env = PendulumEnv(batch_size=[64], image_size=32, horizon=5, seed=seed)
-    env.initial_set = env.safe_set | env.state_space  # half of the episodes start in S
-    salad = SaLaD.from_sizes(latent_dim=3, action_dim=1, action_scale=env.max_action)
-    policy = Policy(latent_dim=3, action_dim=1, action_scale=env.max_action)
-    loss = SSPLLoss(*salad, policy, successor="target")  # preset "sound", delayed barrier for successors
+    make_env = partial(PendulumEnv, image_size=config.env["image_size"])
+    env = make_env(batch_size=[64], seed=seed)
+    env.initial_set = starts_of(env, config.collector.starts)
+    dynamics, policy = LatentDynamics(3, 1, (96, 96), env.max_action), Policy(3, 1, (48, 48), env.max_action)
+    salad = SaLaD(FrameEncoder(3), dynamics, SandwichBarrier(3, (96, 96, 96), lipschitz_bound=2.0))
+    loss = SSPLLoss(*salad, policy)  # preset "sound"
     optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
-    updater = SoftUpdate(loss, tau=0.05)
-    buffer = TensorDictReplayBuffer(storage=LazyTensorStorage(8192), batch_size=64)
-    frames = {"frames_per_batch": 640, "total_frames": 640 * batches, "init_random_frames": 1280}
-    collector = Collector(env, make_rollout_policy(salad, policy), auto_register_policy_transforms=False, **frames)
-    history = []  # mean loss per collected batch
+    store = TransitionStore(1280 * batches)
+    buffer = store.replay_buffer(192, safe=1 / 6, unsafe=1 / 6)
+    frames = {"frames_per_batch": 1280, "total_frames": 1280 * batches, "init_random_frames": 1280 * (batches // 2)}
+    acting = make_rollout_policy(salad, policy)
+    collector = Collector(env, acting, auto_register_policy_transforms=False, max_frames_per_traj=4, **frames)
+    work = Workspace(*salad, policy, config=config.synthesis, source=Source(make_env, salad.encoder, store=store), seed=seed)
+    rounds = Phases(synthesis_phases(config.synthesis, check=CheckRound) if phases else [], work, progress=True)
     if loop:
         for data in collector:
             buffer.extend(data.reshape(-1))
-            history.append(0.0)
             for _ in range(updates):
                 optimizer.zero_grad()
-                value = total(loss(buffer.sample()))
-                value.backward()
+                sum(value for key, value in loss(buffer.sample()).items() if key.startswith("loss_")).backward()
+                torch.nn.utils.clip_grad_norm_(loss.parameters(), 5.0)
                 optimizer.step()
-                updater.step()
-                history[-1] += value.item() / updates
+        rounds.run()
     else:
-        steps = {"total_frames": 640 * batches, "frame_skip": 1, "optim_steps_per_batch": updates}
+        steps = {"total_frames": 1280 * batches, "frame_skip": 1, "optim_steps_per_batch": updates, "clip_norm": 5.0}
         trainer = Trainer(collector=collector, loss_module=loss, optimizer=optimizer, progress_bar=False, **steps)
         ReplayBufferTrainer(buffer, flatten_tensordicts=True).register(trainer)
-        trainer.register_op("post_optim", TargetNetUpdaterHook(updater))  # every update, not every batch
-        trainer.register_op("post_optim_complete_log", lambda _, terms: history.append(total(terms).item()))
+        rounds.register(trainer)  # they run when all transitions are collected
         trainer.train()
-    with torch.no_grad():  # fresh states of S and U
-        pixels = [env.observe(region.sample(2000)) for region in (env.safe_set, env.unsafe_set)]
-        safe, unsafe = (salad.barrier.module(salad.encoder.module(seen)) for seen in pixels)
-    errors = {"safe_error": (safe > 0).float().mean().item(), "unsafe_error": (unsafe <= 0).float().mean().item()}
-    return {"first_loss": history[0], "last_loss": sum(history[-3:]) / len(history[-3:])} | errors
+    agent = Agent.from_loss(loss, level=work.level)
+    measured = evaluate(agent, env, config.evaluation, progress=True)
+    return {name: measured[name] for name in SHOWN}
 
 
 if __name__ == "__main__":
-    print(main(loop="--loop" in sys.argv))
+    flags = {"loop": "--loop" in sys.argv, "phases": "--no-phases" not in sys.argv}
+    print(main(*(word for word in sys.argv[1:] if not word.startswith("--")), **flags))
