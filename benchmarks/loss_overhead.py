@@ -54,11 +54,16 @@ def frozen(module: nn.Module, *inputs: Tensor) -> Tensor:
     return output
 
 
-def bare_sound(nets: list[nn.Module]) -> Callable[[TensorDict], Tensor]:
-    """The terms of `SSPLLoss(preset="sound")`, written out."""
-    encoder, dynamics, barrier, policy, inverse = nets
+def bare_world_model(nets: list[nn.Module]) -> Callable[[TensorDict], Tensor]:
+    """The terms of `SSPLLoss(preset="sound").world_model`, written out."""
+    terms = _world_model(nets)
+    return lambda batch: terms(batch)[0]
 
-    def loss(batch: TensorDict) -> Tensor:
+
+def _world_model(nets: list[nn.Module]) -> Callable[[TensorDict], tuple[Tensor, Tensor]]:
+    encoder, dynamics, barrier, _, inverse = nets
+
+    def loss(batch: TensorDict) -> tuple[Tensor, Tensor]:
         action, region = batch["action"], batch["region"]
         latent, after = encoder.sequence(batch["frames"]).unbind(-2)
         level = barrier(latent)
@@ -72,8 +77,19 @@ def bare_sound(nets: list[nn.Module]) -> Callable[[TensorDict], Tensor]:
         spread = covariance.diagonal()
         total = total + 0.5 * (0.5 - (spread + 1e-8).sqrt()).clamp_min(0).mean()
         total = total + 0.5 * (covariance.square().sum() - spread.square().sum()) / len(covariance)
-        total = total + 0.3 * (depth - 1.4722).clamp_min(0).square().mean()
-        still = latent.detach()
+        return total + 0.3 * (depth - 1.4722).clamp_min(0).square().mean(), latent
+
+    return loss
+
+
+def bare_sound(nets: list[nn.Module]) -> Callable[[TensorDict], Tensor]:
+    """The terms of `SSPLLoss(preset="sound")`, written out."""
+    _, dynamics, barrier, policy, _ = nets
+    world_model = _world_model(nets)
+
+    def loss(batch: TensorDict) -> Tensor:
+        total, latent = world_model(batch)
+        region, still = batch["region"], latent.detach()
         origin = torch.stack([still, torch.rand_like(still) * 2 - 1])
         successor = frozen(dynamics, origin, policy(origin))
         now, then = barrier(torch.stack([origin, successor])).unbind(0)
