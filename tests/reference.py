@@ -100,3 +100,53 @@ def is_positive_definite(weights, multipliers, bound, slope):
         for j in range(i + 1, len(m)):
             m[j, i:] = m[j, i:] - m[j, i] / m[i, i] * m[i, i:]
     return True
+
+
+def with_worst(values, coeff, fraction):
+    """Mean, and so much of the mean over the worst share of the rows."""
+    if not len(values):
+        return 0.0
+    ordered = sorted(values, reverse=True)
+    count = max(1, math.ceil(fraction * len(ordered)))
+    return sum(ordered) / len(ordered) + coeff * sum(ordered[:count]) / count
+
+
+def consistency_loss(predicted, actual, region, unsafe_weight, worst_coeff, worst_fraction):
+    """Loss, mean and largest error of the dynamics."""
+    squares = squared_distance(predicted, actual)[:, 0]
+    weighted = [(unsafe_weight if r == 2 else 1.0) * s for s, r in zip(squares, region[:, 0], strict=True)]
+    errors = [math.sqrt(s) for s in squares]
+    return with_worst(weighted, worst_coeff, worst_fraction), sum(errors) / len(errors), max(errors)
+
+
+def target_loss(
+    barrier, action, barrier_target, inside, action_target, action_weight, region, margin, action_scale, inside_coeff,
+    outside_cap, scale, policy_coeff, safe_coeff, unsafe_coeff, worst_coeff, worst_fraction,
+):  # fmt: skip
+    fit, follow, safe, unsafe = [], [], [], []
+    for k in range(len(barrier)):
+        b, t = barrier[k, 0], barrier_target[k, 0]
+        weight = math.exp(-abs(t) / scale) + 0.1
+        fit.append(weight * (inside_coeff * (b - t) ** 2 if inside[k, 0] else max(0.0, min(t, outside_cap) - b) ** 2))
+        gaps = [((u - v) / s) ** 2 for u, v, s in zip(action[k], action_target[k], action_scale, strict=True)]
+        follow.append(action_weight[k, 0] * sum(gaps) / len(gaps))
+        if region[k, 0] == 1:
+            safe.append(max(0.0, b + margin))
+        if region[k, 0] == 2:
+            unsafe.append(max(0.0, margin - b))
+    return {
+        "loss_target": with_worst(fit, worst_coeff, worst_fraction),
+        "loss_policy_target": policy_coeff * sum(follow) / len(follow),
+        "loss_safe": safe_coeff * with_worst(safe, worst_coeff, worst_fraction),
+        "loss_unsafe": unsafe_coeff * with_worst(unsafe, worst_coeff, worst_fraction),
+    }
+
+
+def multilinear(table, action, action_scale, points):
+    """One dimension after the other, the last one varying fastest."""
+    values = np.asarray(table).reshape([points] * len(action))
+    for u, scale in zip(action, action_scale, strict=True):
+        place = min(max((u / scale + 1) / 2 * (points - 1), 0.0), points - 1.0)
+        low = min(int(place), points - 2)
+        values = values[low] + (place - low) * (values[low + 1] - values[low])
+    return float(values)

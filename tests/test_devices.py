@@ -8,19 +8,13 @@ from tiny import TINY
 
 from torchrl_sspl import load
 from torchrl_sspl.cli import main
+from torchrl_sspl.configs import compose
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.trainers.config import make_config
-from torchrl_sspl.trainers.experiment import Experiment
-from torchrl_sspl.trainers.experiment_config import experiment_config
-from torchrl_sspl.trainers.pipeline import SafePolicyTraining
+from torchrl_sspl.experiments.run import Experiment
 
 ABSENT = f"cuda:{torch.cuda.device_count()}"
-
-
-def environment(n: list[int], seed: int) -> PendulumEnv:
-    return PendulumEnv(batch_size=n, seed=seed, device=None)
 
 
 @pytest.mark.parametrize("name", [ABSENT, "nonsense"])
@@ -30,18 +24,19 @@ def environment(n: list[int], seed: int) -> PendulumEnv:
         usable_device,
         lambda name: load("pendulum", name),
         lambda name: PendulumEnv(batch_size=[1], device=name),
-        lambda name: Experiment(experiment_config([f"device={name}", "out_dir=run"])),
-        lambda name: SafePolicyTraining(make_config([*TINY, f"device={name}", "out_dir=run"]), environment),
+        lambda name: Experiment(compose([*TINY, f"device={name}", "out_dir=run"])),
+        lambda name: Experiment(compose([*TINY, f"device={name}", "out_dir=run"]), PendulumEnv),
     ],
-    ids=["usable_device", "load", "environment", "experiment", "rounds"],
+    ids=["usable_device", "load", "environment", "experiment", "experiment-of-ones-own"],
 )
 def test_a_device_that_is_not_there_is_refused_by_name(use, name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match=rf"expected a device that this machine has.*received '{name}'"):
         use(name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_the_command_line_says_so_too(tmp_path, capsys):
-    assert main(["train", f"device={ABSENT}", f"out_dir={tmp_path}"]) == 2
+    assert main(["train", "env=pendulum", f"device={ABSENT}", f"out_dir={tmp_path}"]) == 2
     assert main(["evaluate", "pendulum", "--device", ABSENT]) == 2
     assert capsys.readouterr().err.count(f"received '{ABSENT}'") == 2

@@ -1,4 +1,4 @@
-"""The floors of the house: imports go downward, and importing the library is light."""
+"""The floors of the house: imports go downward and not in circles, and importing the library is light."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ import torchrl_sspl
 PACKAGE = Path(torchrl_sspl.__file__).parent  # the checkout's, or that of an installed wheel
 ROOT = PACKAGE.parent
 FLOORS = {
-    "errors": 0, "devices": 0, "sets": 0, "functional": 0,
+    "errors": 0, "devices": 0, "sets": 0, "functional": 0, "seeds": 0,
     "lipschitz": 1,
     "modules": 2, "envs": 2, "certification": 2,
-    "objectives": 3, "data": 3, "safety": 3,
-    "trainers": 4, "viz": 4, "cli": 4, "__main__": 4,
+    "viability": 2, "configs": 2, "objectives": 3, "data": 3,
+    "evaluation": 4, "trainers": 5, "viz": 5, "experiments": 6, "cli": 7, "__main__": 7,
 }  # fmt: skip
 HEAVY = ("pybullet", "wandb", "hydra", "ray", "matplotlib", "scipy", "torchrl")
 FILES = sorted(PACKAGE.rglob("*.py"))
@@ -28,18 +28,25 @@ def part_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-def imported(path: Path, source: str) -> set[str]:
-    """Names of the modules that a file imports, anywhere in it, relative imports resolved."""
+def statements(path: Path, source: str) -> list[tuple[str, str]]:
+    """Every import of a file, anywhere in it: module, and name taken from it or ""; relative imports resolved."""
     package = path.relative_to(ROOT).parent.parts
-    names: set[str] = set()
+    found: list[tuple[str, str]] = []
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Import):
-            names |= {alias.name for alias in node.names}
+            found += [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = [*package[: len(package) - node.level + 1]] if node.level else []
             module = ".".join([*base, *([node.module] if node.module else [])])
-            names |= {module} | {f"{module}.{alias.name}" for alias in node.names}
-    return names
+            found += [(module, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Call) and "import_module" in ast.unparse(node.func):
+            found += [(str(a.value), "") for a in node.args[:1] if isinstance(a, ast.Constant)]
+    return found
+
+
+def imported(path: Path, source: str) -> set[str]:
+    """Names of the modules that a file imports, and of what it takes from them."""
+    return {n for module, name in statements(path, source) for n in (module, f"{module}.{name}".rstrip("."))}
 
 
 def breaches(path: Path, source: str) -> list[str]:
@@ -75,10 +82,94 @@ def test_imports_go_downward(path):
         ("certification/statistics.py", "from torchrl_sspl.modules.networks import Policy"),
         ("objectives/base.py", "from torchrl_sspl.trainers.config import make_config"),
         ("viz/plots.py", "from examples.inverted_pendulum import main"),
+        ("viz/plots.py", "if TYPE_CHECKING:\n    from torchrl_sspl.experiments.run import Experiment"),
+        ("viz/plots.py", "importlib.import_module('torchrl_sspl.experiments.run')"),
     ],
 )
 def test_upward_imports_are_seen(file, line):
     assert breaches(PACKAGE / file, line)
+
+
+def module_of(path: Path) -> str:
+    return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
+
+
+def dependencies(sources: dict[Path, str]) -> dict[str, set[str]]:
+    """Modules that each module needs, in functions too, and the packages that are loaded on the way."""
+    modules = {module_of(path): path for path in sources}
+    needs: dict[str, set[str]] = {name: set() for name in modules}
+    for name, path in modules.items():
+        # The package itself loads everything, when asked.
+        for module, taken in () if name == "torchrl_sspl" else statements(path, sources[path]):
+            found = f"{module}.{taken}" if f"{module}.{taken}" in modules else module
+            if found in modules:
+                needs[name].add(found)
+            while found := found.rpartition(".")[0]:
+                if found in modules and not f"{name}.".startswith(f"{found}."):
+                    needs[name].add(found)
+        needs[name] -= {name, "torchrl_sspl"}
+    return needs
+
+
+def circle(needs: dict[str, set[str]]) -> list[str]:
+    """The shortest circle of imports, its first module again at its end; empty where there is none."""
+    best: list[str] = []
+    for start in sorted(needs):
+        before: dict[str, str] = {}
+        queue = [start]
+        for name in queue:
+            for other in sorted(needs[name]):
+                if other == start and (not best or len(trail(before, start, name)) + 1 < len(best)):
+                    best = [*trail(before, start, name), start]
+                if other not in before and other != start:
+                    before[other] = name
+                    queue.append(other)
+    return best
+
+
+def trail(before: dict[str, str], start: str, end: str) -> list[str]:
+    way = [end]
+    while way[0] != start:
+        way.insert(0, before[way[0]])
+    return way
+
+
+def test_no_imports_go_in_circles():
+    found = circle(dependencies({path: path.read_text() for path in FILES}))
+    assert not found, "a circle of imports: " + " -> ".join(found) + "; move what both need to a module below"
+
+
+@pytest.mark.parametrize(
+    ("files", "found"),
+    [
+        ({"sets.py": "import torchrl_sspl.errors", "errors.py": ""}, []),
+        ({"sets.py": "import torchrl_sspl.errors", "errors.py": "from .sets import Box"}, ["errors", "sets", "errors"]),
+        (
+            {"viz/a.py": "def f():\n    from torchrl_sspl.viz.b import g", "viz/b.py": "from torchrl_sspl.viz import a"},
+            ["viz.a", "viz.b", "viz.a"],
+        ),
+        ({"viz/a.py": "import importlib\nimportlib.import_module('torchrl_sspl.viz.a')"}, []),
+        (
+            {"viz/a.py": "x = importlib.import_module('torchrl_sspl.viz.b')", "viz/b.py": "from . import a"},
+            ["viz.a", "viz.b", "viz.a"],
+        ),
+        (  # through what a package loads
+            {"viz/__init__.py": "from torchrl_sspl.viz.a import f", "viz/a.py": "from torchrl_sspl.viz import f"},
+            ["viz", "viz.a", "viz"],
+        ),
+        (
+            {
+                "envs/__init__.py": "from torchrl_sspl.envs.b import g", "envs/b.py": "from torchrl_sspl.data.a import f",
+                "data/a.py": "import torchrl_sspl.envs.c", "envs/c.py": "", "data/__init__.py": "",
+            },
+            ["data.a", "envs", "envs.b", "data.a"],
+        ),
+        ({"viz/__init__.py": "from torchrl_sspl.viz.a import f", "viz/a.py": "from torchrl_sspl.viz import b", "viz/b.py": ""}, []),
+    ],
+)  # fmt: skip
+def test_circles_are_seen(files, found):
+    sources = {PACKAGE / name: text for name, text in files.items()}
+    assert circle(dependencies(sources)) == [f"torchrl_sspl.{name}" for name in found]
 
 
 def test_first_floor_needs_torch_only():

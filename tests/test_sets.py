@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_sspl.errors import ConfigError, EmptyRegionError, NonFiniteError, OverlapError, ShapeError
-from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Box, Difference, Region, Union, check_disjoint, label
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Box, Difference, Mixture, Region, Union, check_disjoint, label
 
 quick = settings(max_examples=40, deadline=None, derandomize=True)
 TURN = 2 * math.pi
@@ -173,3 +173,49 @@ def test_sets_that_share_states_are_an_error_and_touching_ones_are_not():
         check_disjoint(Box([0.0], [1.0]), Box([0.9], [2.0]))
     with pytest.raises(OverlapError):  # a small set inside a large one is seen from the small one
         check_disjoint(Box([-1e4], [1e4]), Box([0.0], [1e-3]))
+
+
+def shares(region: Region, drawn: torch.Tensor) -> list[float]:
+    return [float(part.contains(drawn).float().mean()) for part in region.parts]
+
+
+def test_a_mixture_draws_from_its_parts_in_their_shares():
+    parts = [Box([k], [k + 0.5]) for k in range(3)]
+    mixture = Mixture(parts, [1.0, 0.0, 3.0])
+    drawn = mixture.sample(4000, torch.Generator().manual_seed(0))
+    assert drawn.shape == (4000, 1)
+    assert shares(mixture, drawn) == pytest.approx([0.25, 0.75], abs=0.02)
+    assert not parts[1].contains(drawn).any()
+    low, high = Mixture(parts, [2, 0, 6]), mixture  # only their ratio counts
+    g = torch.Generator()
+    assert torch.equal(low.sample(50, g.manual_seed(1)), high.sample(50, g.manual_seed(1)))
+
+
+def test_a_mixture_is_the_union_of_what_it_draws_from():
+    mixture = Mixture([Box([0.0], [1.0]), Box([2.0], [3.0]), Box([4.0], [5.0])], [1, 1, 0])
+    assert contains(mixture, 0.5, 1.5, 2.5, 4.5) == [True, False, True, False]
+    assert mixture.dim == 1
+
+
+def test_overlapping_parts_are_not_drawn_apart():
+    """Half of the states anywhere, half in a small part: S is seen often, and nothing else is left out."""
+    everywhere, small = Box([0.0], [1.0]), Box([0.0], [0.1])
+    drawn = Mixture([everywhere, small], [0.5, 0.5]).sample(6000, torch.Generator().manual_seed(0))
+    assert float(small.contains(drawn).float().mean()) == pytest.approx(0.55, abs=0.02)
+
+
+@pytest.mark.parametrize("n", [0, 1, 2])
+def test_a_mixture_gives_exactly_as_many_states_as_asked_for(n):
+    assert Mixture([Box([0.0], [1.0]), Box([2.0], [3.0])], [1, 1]).sample(n, torch.Generator().manual_seed(0)).shape == (n, 1)
+
+
+def test_the_same_seed_gives_the_same_mixture():
+    mixture, g = Mixture([Box([0.0], [1.0]), Box([2.0], [3.0])], [1, 2]), torch.Generator()
+    assert torch.equal(mixture.sample(20, g.manual_seed(4)), mixture.sample(20, g.manual_seed(4)))
+    assert not torch.equal(mixture.sample(20, g.manual_seed(4)), mixture.sample(20, g.manual_seed(5)))
+
+
+@pytest.mark.parametrize("wrong", [[1.0], [1.0, -0.1], [0.0, 0.0], [1.0, 2.0, 3.0], []])
+def test_shares_that_make_no_sense_are_an_error(wrong):
+    with pytest.raises(ConfigError, match="one share >= 0 for each of 2 regions"):
+        Mixture([Box([0.0], [1.0]), Box([2.0], [3.0])], wrong)

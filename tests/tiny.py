@@ -1,20 +1,20 @@
-"""Overrides that make a training last seconds."""
+"""Overrides that make a run last seconds."""
 
 from __future__ import annotations
 
-TINY = [
-    "preset=smoke", "progress=false", "checkpoint_seconds=0",
-    "data.transitions=64", "data.safe=16", "data.unsafe=16", "representation.steps=3", "representation.batch=24",
-    "synthesis.rounds=2", "synthesis.transitions=240", "synthesis.rollout_transitions=24", "synthesis.mined_unsafe=16",
-    "synthesis.dynamics_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=3", "synthesis.tune_steps=3",
-    "synthesis.check_episodes=8", "synthesis.check_horizon=2", "synthesis.batch=32", "synthesis.residuals=2", "synthesis.counterexamples=8",
-    "network.barrier_hidden=[8,8]", "network.dynamics_hidden=[8]", "network.policy_hidden=[8]",
-]
-
-
-# Of an experiment: what follows the joint training, and the certificate.
-TINY_EXPERIMENT = [
-    "trainer.restarts=0", "evaluation.certificate_episodes=4", "evaluation.certificate_seconds=2",
+#: The phases on frozen latents, the networks and the certificate.
+TINY_PHASES = [
+    "trainer.progress=false", "logger=none", "evaluation.certificate_episodes=4", "evaluation.certificate_seconds=2",
     "synthesis.dynamics_steps=4", "synthesis.teach_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=3",
     "synthesis.tune_steps=3", "synthesis.batch=32", "synthesis.residuals=2", "synthesis.actions=3",
+    "network.barrier_hidden=[8,8]", "network.dynamics_hidden=[8]", "network.policy_hidden=[8]",
+]  # fmt: skip
+
+#: A main job, all phases of two rounds.
+TINY = [
+    "env=pendulum", "preset=smoke", *TINY_PHASES, "env.image_size=32", "network.pool_to=16",
+    "collector.frames_per_batch=64", "collector.init_random_frames=64", "trainer.total_frames=192",
+    "trainer.optim_steps_per_batch=3", "buffer.batch=24", "synthesis.transitions=240", "synthesis.rollout_transitions=24",
+    "synthesis.rim_transitions=16", "synthesis.rim_draws=2", "synthesis.check_episodes=8", "synthesis.check_horizon=2",
+    "synthesis.counterexamples=8",
 ]  # fmt: skip

@@ -23,6 +23,7 @@ from torchrl_sspl.certification.conditions import (
     search_level,
 )
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.modules import LatentDynamics, Policy
 
 
 def linear(weight: Tensor, bias: Tensor | None = None) -> nn.Linear:
@@ -142,6 +143,13 @@ def test_domain_is_kept_or_a_point_leaves_it():
     assert float(leave.step(refuted.witness[None]).abs().max()) > 1.0
 
 
+@pytest.mark.parametrize(("limit", "status"), [(0.9, "proved"), (1.0, "proved"), (1.5, "refuted")])
+def test_a_clamp_proves_the_domain_only_if_it_lies_in_it(limit, status):
+    step = nn.Sequential(*plant(2.0 * torch.eye(2)), nn.Hardtanh(-limit, limit))
+    system = closed_loop(one_norm(2), step, no_policy(2), latent_dim=2, lipschitz_bound=1.5)
+    assert decide_domain(system).status == status
+
+
 def test_budget_of_no_boxes_leaves_it_undecided():
     found = decide_invariance(linear_system(3, 0.99), budget=Budget(boxes=0))
     assert found.status == "undecided"
@@ -205,6 +213,15 @@ def test_lipschitz_constant_of_the_closed_loop_bounds_its_secants():
     b = a + 0.01 * (b - a)
     secant = ((system.step(a) - system.step(b)).norm(dim=1) / (a - b).norm(dim=1)).max()
     assert 1.0 < float(secant) <= bound
+
+
+def test_lipschitz_constant_of_a_loop_that_stands_still_is_one():
+    dynamics, policy = LatentDynamics(2, 1, (4,)), Policy(2, 1, (4,))
+    for q in dynamics.parameters():
+        q.data.zero_()
+    assert 1.0 <= closed_loop_lipschitz(dynamics, policy) < 1.001
+    with pytest.raises(ConfigError, match="one action scale"):
+        closed_loop_lipschitz(dynamics, Policy(2, 1, (4,), 3.0))
 
 
 def test_what_cannot_be_certified_is_refused():

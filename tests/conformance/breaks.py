@@ -10,18 +10,18 @@ from tensordict import NestedKey, TensorDict
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from torchrl_sspl.objectives import PolicyDeviationLoss, SaLaDLoss, SynthesisLoss
+from torchrl_sspl.objectives import ConsistencyLoss, PolicyDeviationLoss, SaLaDLoss, SynthesisLoss
 from torchrl_sspl.objectives.base import LatentBatch
 
 from .cases import CASES, Case
 
 BY_NAME = {case.name: case for case in CASES}
-BREAKS: dict[str, tuple[Case, type]] = {}
+BREAKS: list[tuple[str, Case, type]] = []
 
 
 def breaks(check: str, case: str) -> Any:
     def register(kind: type) -> type:
-        BREAKS[check] = BY_NAME[case], kind
+        BREAKS.append((check, BY_NAME[case], kind))
         return kind
 
     return register
@@ -226,3 +226,25 @@ class ReportsWhatItFinds(SaLaDLoss):
 class CopiesShallowly(SaLaDLoss):
     def __deepcopy__(self, memo: dict) -> SaLaDLoss:
         return self
+
+
+@breaks("masked_rows_do_not_count", "consistency")
+class CountsAllRows(ConsistencyLoss):
+    def _reduce(self, value: Tensor, batch: LatentBatch, mask: Tensor | None = None, *, worst: bool = False) -> Tensor:
+        batch.valid = None
+        return super()._reduce(value, batch, mask, worst=worst)
+
+
+@breaks("weights_count_rows", "consistency")
+class WeighsTwice(ConsistencyLoss):
+    def _reduce(self, value: Tensor, batch: LatentBatch, mask: Tensor | None = None, *, worst: bool = False) -> Tensor:
+        value = value if batch.weights is None else value * batch.weights
+        return super()._reduce(value, batch, mask, worst=worst)
+
+
+@breaks("keys_and_metrics_are_fixed", "consistency")
+class ReportsTheErrorInU(ConsistencyLoss):
+    def _pack(self, terms: dict[str, Tensor], tensordict: TensorDict) -> TensorDict:
+        if bool((tensordict["region"] == 2).any()):
+            terms["unsafe_dynamics_error"] = terms["dynamics_error"]
+        return TensorDict(terms)

@@ -15,6 +15,7 @@ from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.objectives import (
     ActionValueLoss,
+    ConsistencyLoss,
     LipschitzLoss,
     PolicyDeviationLoss,
     SaLaDLoss,
@@ -230,5 +231,13 @@ CASES = [
         {"loss_action_value": {"actor_network"}},
         "policy",
         {"action_scale": 2.0},
+    ),
+    Case(
+        "consistency",
+        ConsistencyLoss,
+        "latent",
+        {"loss_consistency": {"dynamics"}},
+        "dynamics",
+        {"unsafe_weight": 0.3, "worst_fraction": 0.25},
     ),
 ]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
 from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
+from torchrl_sspl.data.collect import ExploringPolicy, RandomActions
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.sets import SAFE
@@ -96,3 +98,61 @@ def test_bad_arguments_are_named(env):
         collect_random(env, 5, steps=0)
     with pytest.raises(ConfigError, match="region"):
         collect_random(lambda: env, 5, region=env.safe_set)
+
+
+def exploring(exploration: float, random_share: float, value: float = 0.0) -> ExploringPolicy:
+    policy = TensorDictModule(lambda pixels: torch.full((*pixels.shape[:-1], 1), value), ["pixels"], ["action"])
+    return ExploringPolicy(policy, torch.tensor([-2.0]), torch.tensor([2.0]), exploration, random_share)
+
+
+def actions(policy: ExploringPolicy, n: int, times: int) -> torch.Tensor:
+    torch.manual_seed(0)
+    return torch.stack([policy(TensorDict(pixels=torch.zeros(n, 3), batch_size=n))["action"] for _ in range(times)])
+
+
+def test_without_exploration_the_policy_is_itself():
+    assert (actions(exploring(0.0, 0.0, 0.75), 4, 10) == 0.75).all()
+
+
+def test_a_share_of_the_environments_acts_at_random_and_always_the_same_ones():
+    found = actions(exploring(0.0, 0.25), 8, 400)
+    assert (found[:, 2:] == 0).all()
+    assert found[:, :2].abs().max() <= 2.0
+    assert float(found[:, :2].std()) == pytest.approx(4 / 12**0.5, rel=0.05)  # uniform on an interval of length 4
+    assert (actions(exploring(0.0, 1.0), 8, 10) != 0).all()
+
+
+def test_a_single_environment_is_random_in_a_share_of_its_steps():
+    found = actions(exploring(0.0, 0.5), 1, 400)
+    assert float((found == 0).float().mean()) == pytest.approx(0.5, abs=0.08)
+
+
+def test_noise_is_a_share_of_half_the_range_and_stays_in_the_bounds():
+    found = actions(exploring(0.1, 0.0), 50, 200)
+    assert float(found.std()) == pytest.approx(0.2, rel=0.03)
+    assert abs(float(found.mean())) < 0.01
+    at_the_edge = actions(exploring(0.1, 0.0, 2.0), 50, 20)
+    assert at_the_edge.max() == 2.0
+    assert float((at_the_edge == 2.0).float().mean()) == pytest.approx(0.5, abs=0.05)
+
+
+def test_it_writes_nothing_but_the_action_and_leaves_the_policys_output_alone():
+    policy = exploring(0.1, 0.5)
+    data = TensorDict(pixels=torch.zeros(4, 3), other=torch.ones(4), batch_size=4)
+    assert set(policy(data).keys()) == {"pixels", "other", "action"}
+    assert policy.in_keys == ["pixels"]
+    assert policy.out_keys == ["action"]
+
+
+@pytest.mark.parametrize("before", [0, 3])
+def test_random_actions_go_on_where_they_were(env, before):
+    def draw(policy: RandomActions) -> torch.Tensor:
+        return policy(TensorDict(batch_size=[8]))["action"]
+
+    policy, other = RandomActions(env, 5), RandomActions(env, 5)
+    for _ in range(before):
+        draw(policy)
+    draw(other)
+    other.load_state_dict(policy.state_dict())
+    assert torch.equal(draw(policy), draw(other))
+    assert torch.equal(draw(policy), draw(other))

@@ -9,10 +9,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
-from torchrl_sspl.certification.ground_truth import viability_kernel
 from torchrl_sspl.envs.dubins import YAW_LAG, Disc, DubinsEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+from torchrl_sspl.viability.grid import viability_kernel
 
 
 @pytest.mark.parametrize("batch_size", [[], [3]])

@@ -8,9 +8,9 @@ import torch
 from torch import nn
 
 from torchrl_sspl.envs.dubins import DubinsEnv
+from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.trainers.evaluation import rollout
 
 
 def straight_ahead() -> Agent:
@@ -28,17 +28,20 @@ def straight_ahead() -> Agent:
 def test_after_leaving_the_arena_a_robot_stands_still_inside_the_set_and_without_error():
     env = DubinsEnv(batch_size=[2])
     start = torch.tensor([[1.85, 0.0, 0.0], [-1.9, 1.0, 0.0]])  # leaves after two steps; stays for long
-    episodes = rollout(straight_ahead(), env, start, 5)
+    episodes = simulate(straight_ahead(), env, start=start, horizon=5)
     torch.testing.assert_close(episodes.states[2:, 0, 0], torch.full((4,), 2.05))
     torch.testing.assert_close(episodes.states[:, 1, 0], -1.9 + 0.1 * torch.arange(6.0))
     assert episodes.barrier[:, 0].tolist() == [0.5, 0.5, -1.0, -1.0, -1.0, -1.0]
     assert bool((episodes.barrier[:, 1] == 0.5).all())
     assert float(episodes.prediction_error[1:, 0].max()) == 0.0
     assert float(episodes.prediction_error[:, 1].min()) > 0.0
+    assert episodes.events["left"].tolist() == [True, False]
+    assert episodes.alive[:, 0].tolist() == [True] * 3 + [False] * 3
+    assert bool(episodes.alive[:, 1].all())
 
 
 def test_a_robot_that_leaves_cannot_come_back_into_the_unsafe_set():
     env = DubinsEnv(batch_size=[1])
-    episodes = rollout(straight_ahead(), env, torch.tensor([[2.0, 0.0, -math.pi / 2], [1.99, 0.0, 0.0]]), 40)
+    episodes = simulate(straight_ahead(), env, start=torch.tensor([[2.0, 0.0, -math.pi / 2], [1.99, 0.0, 0.0]]), horizon=40)
     assert not bool(env.unsafe_set.contains(episodes.states).any())
     assert not bool(env.state_space.contains(episodes.states[-1]).any())

@@ -13,16 +13,19 @@ import pytest
 import torch
 from conformance.cases import CASES, Case
 from tensordict import TensorDict
-from tiny import TINY as SMOKE
-from tiny import TINY_EXPERIMENT
+from tiny import TINY, TINY_PHASES
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
 
-from torchrl_sspl import certify, load
+from torchrl_sspl import certify, evaluate, load
 from torchrl_sspl.certification import Budget
+from torchrl_sspl.configs import EvaluationConfig, compose
 from torchrl_sspl.data import TransitionStore, collect_random
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.evaluation import certify_on_episodes, evaluate_episodes, simulate
+from torchrl_sspl.evaluation.known import encode_states, latency
+from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.lipschitz import (
     LMIBarrier,
     SandwichBarrier,
@@ -34,26 +37,18 @@ from torchrl_sspl.lipschitz import (
 from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy, SaLaD, make_rollout_policy
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.objectives import SSPLLoss
-from torchrl_sspl.trainers import certify_on_episodes, evaluate, rollout
-from torchrl_sspl.trainers.config import EvaluationConfig, make_config
-from torchrl_sspl.trainers.episodes import evaluate_episodes
-from torchrl_sspl.trainers.evaluation import encode_states
-from torchrl_sspl.trainers.experiment import Experiment
-from torchrl_sspl.trainers.experiment_config import EnvFactory, EpisodesConfig, experiment_config
-from torchrl_sspl.trainers.paper import PaperTraining
-from torchrl_sspl.trainers.pipeline import SafePolicyTraining
-from torchrl_sspl.trainers.quadruped import latency
 
 pytestmark = [
     pytest.mark.gpu,
     pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device"),
     pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore::UserWarning"),
 ]
-TINY = [
-    "trainer.total_frames=512", "trainer.optim_steps_per_batch=4", "trainer.warm_start_steps=4", "trainer.progress=false",
-    "trainer.checkpoint_every=-1", "collector.frames_per_batch=256", "collector.envs=64", "collector.init_random_frames=256",
-    "buffer.batch=64", "env.image_size=32", "evaluation.episodes=8", "evaluation.envs=8", "evaluation.horizon=4",
-    *TINY_EXPERIMENT,
+JOINT = [
+    "env=pendulum", *TINY_PHASES, "trainer.total_frames=512", "trainer.optim_steps_per_batch=4", "trainer.warm_start_steps=4",
+    "trainer.checkpoint_seconds=-1", "trainer.restarts=0", "collector.frames_per_batch=256", "collector.envs=64",
+    "collector.init_random_frames=256", "collector.random_share=0.5", "buffer.batch=64", "env.image_size=32",
+    "evaluation.episodes=8", "evaluation.horizon=4", "evaluation.grid=7", "evaluation.kernel_grid=31",
+    "evaluation.renderer_episodes=0", "synthesis.enabled=false",
 ]  # fmt: skip
 
 
@@ -137,17 +132,16 @@ def test_mixed_precision_stays_near():
 
 @pytest.mark.parametrize("options", [[], ["trainer.autocast=bfloat16"], ["trainer.compile=true"]], ids=["plain", "mixed", "compile"])
 def test_experiments_train_on_the_gpu_and_return_an_agent_on_the_cpu(options, tmp_path):
-    experiment = Experiment(experiment_config([*TINY, *options, "device=cuda", f"out_dir={tmp_path}"]))
+    experiment = Experiment(compose([*JOINT, *options, "device=cuda", f"out_dir={tmp_path}"]))
     outcome = experiment.run()
     assert all(p.is_cuda for p in experiment.loss.parameters())
     assert all(torch.isfinite(p).all() for p in experiment.loss.parameters())
     assert all(not p.is_cuda for p in outcome.agent.parameters())
-    assert outcome.evaluation["starts_inside"] is not None
+    assert outcome.evaluation["volume_over_kernel"] is not None
 
 
 def saving_experiment(directory: Path, device: str) -> Experiment:
-    options = ["trainer.checkpoint_every=256", f"device={device}", f"out_dir={directory}"]
-    return Experiment(experiment_config([*TINY, *options]))
+    return Experiment(compose([*JOINT, "trainer.checkpoint_seconds=0", f"device={device}", f"out_dir={directory}"]))
 
 
 def interrupt(experiment: Experiment) -> None:
@@ -170,34 +164,70 @@ def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(tmp_path):
     with pytest.raises(InterruptedError):
         interrupt(saving_experiment(tmp_path / "broken", "cuda"))
     resumed = saving_experiment(tmp_path / "broken", "cuda")
-    resumed.train(resume=True)
+    resumed.train()
     found = resumed.loss.state_dict()
     for key, value in whole.loss.state_dict().items():
         if isinstance(value, torch.Tensor):
             torch.testing.assert_close(value, found[key], msg=key)
 
 
-@pytest.mark.parametrize("kind", [SafePolicyTraining, PaperTraining])
-def test_rounds_learn_from_pixels_on_the_gpu(kind, tmp_path):
-    devices = []
+ROUND = ["gather", "dynamics", "fit", "steer", "tune", "check"]
+AS_PRINTED = ["loss.preset=paper", "loss.reduction=mean", "network.barrier=lmi", "trainer.margins=true"]
 
-    class Watched(kind):
-        def _mixed_batch(self, stores):
-            batch = super()._mixed_batch(stores)
-            devices.append(batch["frames"].device.type)
-            return batch
 
-    config = make_config([*SMOKE, "device=cuda", f"out_dir={tmp_path}"])
-    result = Watched(config, lambda n, seed: PendulumEnv(batch_size=n, seed=seed)).run()
+@pytest.mark.parametrize(
+    ("words", "phases"),
+    [
+        ([], 2 * ROUND),
+        (["synthesis.teacher=value", "synthesis.rounds=1"], [*ROUND[:2], "teach", *ROUND[2:]]),
+        (AS_PRINTED, []),
+    ],
+    ids=["rounds", "taught", "as-printed"],
+)
+def test_all_phases_learn_from_pixels_on_the_gpu(words, phases, tmp_path):
+    experiment = Experiment(compose([*TINY, *words, "device=cuda", f"out_dir={tmp_path}"]))
+    devices, stepper = [], experiment.trainer.optimization_stepper
+    step = stepper.step
+
+    def watched(trainer, batch):
+        devices.append(batch["frames"].device.type)
+        return step(trainer, batch)
+
+    stepper.step = watched
+    agent = experiment.train()
     assert set(devices) == {"cuda"}
-    assert all(not p.is_cuda for p in result.agent.parameters())
+    assert all(p.is_cuda for p in experiment.loss.parameters())
+    assert all(not p.is_cuda for p in agent.parameters())
+    assert [phase.name for phase in experiment.phases.phases] == phases
+    assert experiment.phases.finished
+
+
+def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(tmp_path):
+    words = [*TINY, "synthesis.rounds=1", "trainer.checkpoint_seconds=0", "device=cuda"]
+    whole = Experiment(compose([*words, f"out_dir={tmp_path / 'whole'}"])).train()
+    broken = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"]))
+    save = broken.trainer.save_trainer
+
+    def stop_in_steer(force_save=False):
+        save(force_save)
+        if broken.work.where["phase"] == "steer":
+            raise InterruptedError
+
+    broken.trainer.save_trainer = stop_in_steer
+    with pytest.raises(InterruptedError):
+        broken.train()
+    found = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"])).train().state_dict()
+    for key, value in whole.state_dict().items():
+        torch.testing.assert_close(value, found[key], msg=key)
 
 
 def test_moment_encoder_is_fitted_on_the_gpu(tmp_path):
-    options = ["network.encoder=MomentEncoder", "network.latent_dim=4", "device=cuda", f"out_dir={tmp_path}"]
-    config = make_config([*SMOKE, *options])
-    training = SafePolicyTraining(config, lambda n, seed: DubinsEnv(batch_size=n, seed=seed, image_size=64))
-    assert all(not p.is_cuda for p in training.run().agent.parameters())
+    words = [w for w in TINY if w not in ("env=pendulum", "env.image_size=32", "network.pool_to=16")]
+    words += ["env=dubins", "env.image_size=64", "network.pool_to=32", "synthesis.rounds=1", "device=cuda", f"out_dir={tmp_path}"]
+    experiment = Experiment(compose(words))
+    assert type(experiment.encoder).__name__ == "MomentEncoder"
+    assert all(not p.is_cuda for p in experiment.train().parameters())
+    assert experiment.phases.finished
 
 
 def test_environment_on_the_gpu_draws_what_it_draws_on_the_cpu():
@@ -216,11 +246,10 @@ def test_collected_data_lie_in_host_memory_and_batches_on_the_gpu():
 
 
 def test_agents_are_evaluated_on_the_gpu(tmp_path):
-    config = experiment_config([*TINY, f"out_dir={tmp_path}"])
-    agent = Experiment(config).train()
-    sizes = EpisodesConfig(episodes=8, envs=8, horizon=4)
-    here = evaluate_episodes(agent, EnvFactory(config.env), sizes)
-    there = evaluate_episodes(agent.cuda(), EnvFactory(config.env), sizes)
+    experiment = Experiment(compose([*JOINT, f"out_dir={tmp_path}"]))
+    agent, sizes = experiment.train(), EvaluationConfig(episodes=8, envs=8, horizon=4)
+    here = evaluate_episodes(agent, experiment.make_env, sizes)
+    there = evaluate_episodes(agent.cuda(), experiment.make_env, sizes)
     assert abs(here["on_policy_error_mean"] - there["on_policy_error_mean"]) < 1e-2
 
 
@@ -234,10 +263,12 @@ def test_measurements_on_the_true_system_are_those_of_the_cpu(pair):
     env = PendulumEnv(batch_size=[1])
     states = env.sample_states(100, torch.Generator().manual_seed(0))
     torch.testing.assert_close(*(encode_states(agent, env, states) for agent in pair), rtol=1e-3, atol=1e-3)
-    here, there = (rollout(agent, env, states, 3) for agent in pair)
-    for field in dataclasses.fields(here):
-        torch.testing.assert_close(getattr(here, field.name), getattr(there, field.name), rtol=1e-2, atol=1e-2)
-    found = evaluate(pair[1], env, EvaluationConfig(grid=11, kernel_grid=31, rollouts=10, horizon=3))
+    here, there = (simulate(agent, env, start=states, horizon=3) for agent in pair)
+    compared = [f.name for f in dataclasses.fields(here) if isinstance(getattr(here, f.name), torch.Tensor)]
+    assert {"actions", "states", "barrier", "latent", "prediction_error", "barrier_error"} <= set(compared)
+    for name in compared:
+        torch.testing.assert_close(getattr(here, name), getattr(there, name), rtol=1e-2, atol=1e-2)
+    found = evaluate(pair[1], env, EvaluationConfig(grid=11, kernel_grid=31, episodes=10, horizon=3))
     assert found["volume_over_kernel"] > 0
     assert pair[1].barrier[0].weight.is_cuda, "the caller's agent is left where it is"
 
@@ -273,10 +304,9 @@ def test_lipschitz_constants_of_networks_on_the_gpu(kind):
     assert prove_lipschitz(plain, 1.001 * there.lipschitz_bound, multipliers=multipliers).proved
 
 
-def test_figures_and_films_of_an_agent_on_the_gpu(pair, tmp_path):
+def test_figures_of_an_agent_on_the_gpu(pair):
     viz = pytest.importorskip("torchrl_sspl.viz")
     pytest.importorskip("matplotlib")
     env, agent = PendulumEnv(batch_size=[1]), pair[1]
-    assert viz.animate(agent, env, torch.tensor([0.1, 0.0]), 3, tmp_path / "film.gif").is_file()
     latent = agent.encode(env.observe(env.sample_states(50)).cuda())
     assert viz.latent_space(latent, torch.arange(50, device="cuda") % 3, agent.barrier) is not None

@@ -58,8 +58,8 @@ def test_a_run_that_began_on_a_gpu_goes_on_without_one(environment, tmp_path):
     code += f"test_gpu.interrupt(test_gpu.saving_experiment(Path({str(tmp_path)!r}), 'cuda'))"
     assert "InterruptedError" in python(environment, "-c", code).stderr
     experiment = saving_experiment(tmp_path, "cpu")
-    experiment.train(resume=True)
-    assert experiment.resumed
+    experiment.train()
+    assert experiment.trainer.resumed
     assert experiment.trainer.collected_frames == 512
 
 

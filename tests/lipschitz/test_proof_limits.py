@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import nn
 
-from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.errors import ConfigError, ShapeError, StructureError
 from torchrl_sspl.lipschitz import (
     LMIBarrier,
     SandwichBarrier,
@@ -93,6 +93,80 @@ def test_slopes_of_the_activation_lie_in_the_interval(activation):
     slopes = activation(x).diff() / x.diff()
     assert low - 1e-9 <= float(slopes.min()) <= low + 0.01
     assert high - 0.01 <= float(slopes.max()) <= high + 1e-9
+
+
+@pytest.mark.parametrize("slope", [0.1, -0.3, 1.7])
+def test_slope_of_a_leaky_relu_holds_that_of_its_float32_kernel(slope):
+    low, high = slope_interval(nn.Sequential(nn.Linear(1, 1), nn.LeakyReLU(slope), nn.Linear(1, 1)))
+    deployed = float(torch.tensor(slope, dtype=torch.float32))
+    assert low <= min(slope, deployed, 1.0)
+    assert max(slope, deployed, 1.0) <= high
+
+
+# --- networks that are more than they say, or jump ---------------------------------------------------------------------
+
+
+class TwiceLinear(nn.Linear):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return 2.0 * super().forward(x)
+
+
+class Shifted(nn.Sequential):
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return x + super().forward(x)
+
+
+def changed(change) -> nn.Sequential:
+    network = plain(nn.ReLU(), (2, 4, 1))
+    return change(network) or network
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda n: nn.Sequential(TwiceLinear(2, 1)), "SUBCLASSED"),
+        (lambda n: Shifted(*n), "SUBCLASSED"),
+        (lambda n: nn.Sequential(n[0], nn.Softplus(threshold=0.5), n[2]), "NOT_UNDERSTOOD"),
+        (lambda n: n.register_forward_hook(lambda m, i, o: 2 * o) and None, "HOOKED"),
+        (lambda n: n[0].register_forward_pre_hook(lambda m, i: (2 * i[0],)) and None, "HOOKED"),
+        (lambda n: setattr(n[0], "forward", lambda x: x.square()), "OVERRIDDEN"),
+        (lambda n: torch.nn.utils.parametrizations.spectral_norm(n[0]) and None, "PARAMETRIZED"),
+        (lambda n: LMIBarrier(2, (4,)).register_forward_hook(lambda m, i, o: 2 * o) and Collapses(n), "NOT_UNDERSTOOD"),
+    ],
+)
+def test_proofs_refuse_what_they_do_not_know_exactly(change, reason):
+    network = changed(change)
+    for function in (lambda: prove_lipschitz(network, 50.0), lambda: lipschitz_upper(network)):
+        with pytest.raises(StructureError) as error:
+            function()
+        assert error.value.reason == reason
+
+
+class Collapses(nn.Module):
+    """Says that it is a network which it is not."""
+
+    def __init__(self, network: nn.Sequential) -> None:
+        super().__init__()
+        self.network = network
+
+    def collapse(self) -> nn.Sequential:
+        return self.network
+
+
+def test_barriers_of_the_library_are_proved_by_what_they_collapse_to_unless_they_were_changed():
+    for barrier in (SandwichBarrier(2, (8,), 2.0), LMIBarrier(2, (8,), 2.0)):
+        assert prove_lipschitz(barrier, 2.0).proved
+        barrier.collapse = lambda: nn.Sequential(nn.Linear(2, 1))
+        with pytest.raises(StructureError, match="collapse"):
+            prove_lipschitz(barrier, 2.0)
+
+
+def test_softplus_with_a_low_threshold_jumps():
+    soft = nn.Softplus(threshold=0.5)
+    x = torch.tensor([0.5, 0.500001])
+    assert float(soft(x).diff()) < -0.4  # from above: no Lipschitz constant at all
+    high = nn.Sequential(nn.Linear(1, 1), nn.Softplus(threshold=25.0), nn.Linear(1, 1))
+    assert slope_interval(high) == (0.0, 1.0)
 
 
 def test_slope_that_the_activation_exceeds_is_refused():

@@ -4,17 +4,31 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 import torchrl_sspl as sspl
 from torchrl_sspl.errors import CheckpointError, ConfigError
-from torchrl_sspl.modules.agent import DESCRIPTION_FILE, WEIGHTS_FILE, Agent, agent_directory, mlp_barrier
+from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
+from torchrl_sspl.modules.agent import (
+    DESCRIPTION_FILE,
+    WEIGHTS_FILE,
+    Agent,
+    agent_directory,
+    build_encoder,
+    call_with,
+    mlp_barrier,
+)
+from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
+from torchrl_sspl.modules.salad import SaLaD
+from torchrl_sspl.objectives import SSPLLoss
 
 NETWORKS = {
     "encoder": {"class": "FrameEncoder", "arguments": {"latent_dim": 2, "image_size": 32}},
@@ -178,3 +192,170 @@ def test_unknown_name_lists_the_shipped_agents(tmp_path, monkeypatch, saved):
     with pytest.raises(CheckpointError, match=r"\(cartpole, walker\).*received 'pendulumm'"):
         sspl.load("pendulumm")
     assert sspl.load("walker").latent_dim == 2
+
+
+def networks(barrier: type = SandwichBarrier) -> list[nn.Module]:
+    torch.manual_seed(0)
+    return [FrameEncoder(2, 32), LatentDynamics(2, 1, (8,), 10.0), barrier(2, (8,), 1.5), Policy(2, 1, (8,), 10.0)]
+
+
+def state(nets: list[nn.Module]) -> list[tuple]:
+    """Weights, whether they take a gradient, and the mode of every part."""
+    values = [(n, v.clone(), v.requires_grad) for net in nets for n, v in (*net.named_parameters(), *net.named_buffers())]
+    return [*values, *((n, m.training, type(m)) for net in nets for n, m in net.named_modules())]
+
+
+def assert_unchanged(before: list[tuple], after: list[tuple]) -> None:
+    assert len(before) == len(after)
+    for one, other in zip(before, after, strict=True):
+        assert one[0] == other[0]
+        assert torch.equal(one[1], other[1]) if isinstance(one[1], torch.Tensor) else one[1] == other[1]
+        assert one[2] == other[2]
+
+
+@pytest.mark.parametrize("barrier", [SandwichBarrier, LMIBarrier])
+def test_an_agent_of_networks_in_training_is_a_copy_and_changes_nothing(barrier):
+    nets = networks(barrier)
+    before = state(nets)
+    agent = Agent.from_networks(*nets, level=0.1, description={"note": [1]})
+    assert_unchanged(before, state(nets))
+    own = {v.data_ptr() for net in nets for v in net.parameters()}
+    assert not own & {v.data_ptr() for v in agent.parameters()}
+    kept = {k: v.clone() for k, v in agent.state_dict().items()}
+    with torch.no_grad():
+        for net in nets:
+            for value in net.parameters():
+                value.add_(1.0)
+    for name, value in agent.state_dict().items():
+        assert torch.equal(value, kept[name]), name
+
+
+@pytest.mark.parametrize("barrier", [SandwichBarrier, LMIBarrier])
+def test_its_level_becomes_zero_and_its_bound_is_proved(barrier):
+    nets = networks(barrier)
+    z = torch.rand(50, 2) * 2 - 1
+    with torch.no_grad():
+        expected = nets[2](z) - 0.125
+    agent = Agent.from_networks(*nets, level=0.125)
+    torch.testing.assert_close(agent.barrier(z), expected, rtol=1e-5, atol=1e-6)
+    assert agent.lipschitz_bound == 1.5
+    assert agent.description["lipschitz"]["proved"], agent.description["lipschitz"]["reason"]
+    assert not any(p.requires_grad for p in agent.parameters())
+
+
+def test_an_agent_of_a_loss_has_the_networks_of_the_loss():
+    nets = networks()
+    salad = SaLaD(*nets[:3])
+    loss = SSPLLoss(*salad, nets[3])
+    before, given = state(nets), {"mine": 1}
+    agent = Agent.from_loss(loss, level=-0.05, description=given)
+    assert_unchanged(before, state(nets))
+    assert given == {"mine": 1}
+    expected = Agent.from_networks(*nets, level=-0.05)
+    for name, value in expected.state_dict().items():
+        assert torch.equal(value, agent.state_dict()[name]), name
+    assert {p.data_ptr() for p in loss.parameters()}.isdisjoint(p.data_ptr() for p in agent.parameters())
+    loss(_batch())  # the loss still works
+
+
+def _batch():
+    from tensordict import TensorDict
+
+    return TensorDict(
+        frames=torch.randint(0, 256, (6, 3, 3, 32, 32), dtype=torch.uint8),
+        action=torch.zeros(6, 1),
+        region=torch.arange(6)[:, None] % 3,
+        batch_size=6,
+    )
+
+
+def test_an_agent_of_networks_is_saved_and_found_again(tmp_path):
+    agent = Agent.from_networks(*networks(), level=0.1, description={"config": {"seed": 3}})
+    again = Agent.load(agent.save(tmp_path))
+    for name, value in agent.state_dict().items():
+        assert torch.equal(value, again.state_dict()[name]), name
+    assert again.description["config"] == {"seed": 3}
+
+
+def test_encoders_are_built_by_name_with_the_sizes_that_they_take():
+    sizes = {"latent_dim": 4, "image_size": 64, "pool_to": 16, "velocity_gain": 2.0}
+    frame, moment = build_encoder("FrameEncoder", **sizes), build_encoder("MomentEncoder", **sizes)
+    assert isinstance(frame, FrameEncoder)
+    assert isinstance(moment, MomentEncoder)
+    assert frame(torch.zeros(2, 6, 64, 64, dtype=torch.uint8)).shape == (2, 4)
+    with pytest.raises(ConfigError, match=r"network\.encoder to be one of .*FrameEncoder.*or package.module:Class.*received 'nobody:No'"):
+        build_encoder("nobody:No", **sizes)
+    with pytest.raises(ConfigError, match="a function latent_dim -> module, received a module; give its class, Identity"):
+        call_with(nn.Identity(), sizes)
+    with pytest.raises(ConfigError, match="one that raises TypeError"):
+        call_with(lambda: None, sizes)
+    assert call_with(lambda size: nn.Linear(6, size), sizes).out_features == 4  # whatever it calls it
+
+
+OWN = """
+import torch
+from torch import nn
+
+
+class Outer:
+    class Encoder(nn.Module):
+        def __init__(self, latent_dim, pool_to=4):
+            super().__init__()
+            self.net = nn.Sequential(nn.AdaptiveAvgPool2d(pool_to), nn.Flatten(), nn.Linear(6 * pool_to**2, latent_dim), nn.Tanh())
+
+        def forward(self, pixels):
+            return self.net(pixels.float() / 255)
+
+
+class Policy(nn.Module):
+    def __init__(self, latent_dim):
+        super().__init__()
+        self.net = nn.Linear(latent_dim, 1)
+
+    def forward(self, latent):
+        return self.net(latent).tanh()
+
+
+if __name__ == "__main__":
+    from torchrl_sspl.lipschitz import SandwichBarrier
+    from torchrl_sspl.modules import LatentDynamics
+    from torchrl_sspl.modules.agent import Agent
+
+    nets = Outer.Encoder(2), LatentDynamics(2, 1, (8,)), SandwichBarrier(2, (8,)), Policy(2)
+    agent = Agent.from_networks(*nets)
+    agent.save("agent")
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    """A folder with a module of the user's, in which one works."""
+    (tmp_path / "my_networks.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    yield "my_networks"
+    sys.modules.pop("my_networks", None)
+
+
+def test_networks_of_ones_own_are_found_by_their_import_path(own_module, tmp_path, monkeypatch):
+    encoder = build_encoder(f"{own_module}:Outer.Encoder", latent_dim=2, pool_to=3, velocity_gain=4.0)
+    policy = call_with(sys.modules[own_module].Policy, {"latent_dim": 2})  # a name that the library has too
+    agent = Agent.from_networks(encoder, networks()[1], networks()[2], policy)
+    described = agent.description["networks"]
+    assert described["encoder"] == {"class": "my_networks:Outer.Encoder", "arguments": {"latent_dim": 2, "pool_to": 3}}
+    assert described["policy"]["class"] == "my_networks:Policy"
+    again = Agent.load(agent.save(tmp_path / "agent"))
+    pixels = torch.randint(0, 256, (4, 6, 16, 16), dtype=torch.uint8)
+    for one, other in zip(agent.act(pixels), again.act(pixels), strict=True):
+        assert torch.equal(one, other)
+    sys.modules.pop("my_networks")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    with pytest.raises(CheckpointError, match=r"'my_networks:Outer\.Encoder' cannot be built.*run from the folder that holds"):
+        Agent.load(tmp_path / "agent")
+
+
+def test_an_agent_written_by_a_program_names_the_programs_file(own_module, tmp_path):
+    runpy.run_path(f"{own_module}.py", run_name="__main__")
+    agent = Agent.load(tmp_path / "agent")
+    assert agent.description["networks"]["encoder"]["class"] == "my_networks:Outer.Encoder"
+    assert agent.act(torch.zeros(2, 6, 16, 16, dtype=torch.uint8))[0].shape == (2, 1)

@@ -10,11 +10,10 @@ import torch
 import torchrl_sspl as sspl
 from torchrl_sspl.certification import Certificate
 from torchrl_sspl.envs.dubins import YAW_LAG, DubinsEnv
+from torchrl_sspl.evaluation import simulate, verify_run
+from torchrl_sspl.evaluation.certify import CERTIFICATE_FILE
+from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.modules.agent import agent_directory
-from torchrl_sspl.trainers.certify import CERTIFICATE_FILE, verify_run
-from torchrl_sspl.trainers.evaluation import encode_states, rollout
-from torchrl_sspl.trainers.quadruped import walk
-from torchrl_sspl.trainers.quadruped_run import make_physics
 
 
 @pytest.fixture(scope="module")
@@ -32,21 +31,20 @@ def test_on_the_model_it_tells_the_labels_apart_and_stays_out_of_the_unsafe_set(
     states = env.sample_states(400, generator, region=env.state_space - env.unsafe_set)
     inside = states[agent.barrier(encode_states(agent, env, states))[:, 0] <= 0]
     assert len(inside) > 300
-    episodes = rollout(agent, env, inside, 30)
+    episodes = simulate(agent, env, start=inside, horizon=30)
     assert not bool(env.unsafe_set.contains(episodes.states).any())
 
 
 @pytest.mark.parametrize("start", [(-1.9, 0.0, 0.0), (1.6, 0.3, 3.1), (0.2, -1.6, 1.6)])
 def test_the_robot_walks_past_an_obstacle_ahead(agent, start):
-    world = make_physics(DubinsEnv(batch_size=[1]))()
+    world = DubinsEnv(batch_size=[1]).physics()()
     try:
-        found = walk(agent, world, start, 60)
+        found = simulate(agent, world, start=torch.tensor([start]), horizon=60)
     finally:
         world.close()
-    assert found.left
-    assert not (found.entered)
-    assert not (found.hit)
-    assert not (found.fallen)
+    assert {name: bool(seen[0]) for name, seen in found.events.items()} == {
+        "left": True, "entered": False, "hit": False, "fallen": False,
+    }  # fmt: skip
 
 
 def test_its_certificate_is_found_again_and_does_not_claim_what_is_not_so(agent):
@@ -59,6 +57,8 @@ def test_its_certificate_is_found_again_and_does_not_claim_what_is_not_so(agent)
 
 def test_its_evaluation_names_settings_and_seed():
     body = json.loads((agent_directory("quadruped") / "evaluation.json").read_text())
+    assert body["schema"] == 1
     assert body["seed"] == 0
     assert body["preset"] == "sound"
-    assert body["measurements"]["walks_from_set_enter"]["n"] == 200
+    assert body["measurements"]["own"]["walks_from_set_enter"]["n"] == 200
+    assert body["config"]["env"]["yaw_lag"] == list(YAW_LAG)

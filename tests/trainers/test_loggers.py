@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
-from test_torchrl_trainer import build
 from torchrl.record.loggers.csv import CSVLogger
 
 from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, ShapeError
@@ -85,6 +86,54 @@ def test_wandb_stays_on_disk_without_a_key(tmp_path, figure, monkeypatch):
     assert "WANDB_MODE" not in __import__("os").environ
 
 
+def test_wandb_takes_a_figure_where_nobody_has_imported_pyplot(tmp_path):
+    pytest.importorskip("wandb")
+    pytest.importorskip("matplotlib")
+    program = """
+import sys, warnings
+warnings.simplefilter("error", UserWarning)  # what a logger that fails costs
+from torchrl_sspl.trainers.loggers import close_logger, log_figure, make_logger
+from torchrl_sspl.viz.plane import new_figure
+logger = make_logger("wandb", directory=sys.argv[1])
+log_figure(logger, "latent", new_figure(1, 1), 7)
+close_logger(logger)
+assert "matplotlib.pyplot" not in sys.modules
+"""
+    told = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)], capture_output=True, text=True, check=False,
+        env=os.environ | {"WANDB_MODE": "offline", "WANDB_SILENT": "true"},
+    )  # fmt: skip
+    assert told.returncode == 0, told.stderr
+    assert list((tmp_path / "wandb").glob("offline-run-*/files/media/images/latent*.png"))
+
+
+class Broken:
+    """A logger that takes nothing, as a full disk or a lost server."""
+
+    log_dir, exp_name = "/dev/null/nowhere", "run"
+
+    class experiment:
+        def close():
+            raise OSError("no space left on device")
+
+    def log_scalar(self, name, value, step, **options):
+        raise OSError("no space left on device")
+
+
+def test_a_logger_that_fails_costs_a_warning(figure):
+    logger = Broken()
+    for call in (
+        lambda: log_scalars(logger, {"grad_norm": 1.0}, step=0),
+        lambda: log_figure(logger, "latent", figure, 0),
+        lambda: log_video(logger, "episode", film(), 0),
+        lambda: close_logger(logger),
+    ):
+        with pytest.warns(UserWarning, match="Broken did not take"):
+            assert call() is None
+    with pytest.raises(ConfigError, match="METRICS"):  # a mistake of ours is one
+        log_scalars(logger, {"my_number": 1.0}, step=0)
+
+
 @pytest.mark.parametrize(
     ("key", "mode", "reachable", "offline"),
     [
@@ -149,6 +198,8 @@ def test_documented_names_are_the_names_of_the_library():
 
 
 def emitted(folder: Path, **options) -> set[str]:
+    from test_trainer import build
+
     trainer = build(batches=2, logger=CSVLogger("run", log_dir=str(folder)), log_interval=0, **options)
     RestartHook(trainer, lambda attempt: trainer.loss_module, after=10**6, most=1).register(trainer)
     trainer.train()
@@ -186,15 +237,15 @@ def test_emitted_names_are_the_documented_ones(tmp_path):
 def rounds() -> set[str]:
     from dataclasses import fields
 
-    from torchrl_sspl.trainers.pipeline import Check
+    from torchrl_sspl.trainers.phases import Check
 
     checks = {f.name for f in fields(Check)} - {"round", "reason"}
     return checks | {"inside_of_allowed", "sweeps"}
 
 
 def evaluations() -> set[str]:
-    from torchrl_sspl.trainers.episodes import logged
-    from torchrl_sspl.trainers.evaluation import Evaluation, share
+    from torchrl_sspl.evaluation.episodes import logged
+    from torchrl_sspl.evaluation.known import Evaluation, share
 
     result = Evaluation()
     for name in METRICS:

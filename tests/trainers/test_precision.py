@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import pytest
 import torch
-from tiny import TINY_EXPERIMENT
+from tiny import TINY_PHASES
 
-from torchrl_sspl.trainers.experiment import Experiment
-from torchrl_sspl.trainers.experiment_config import experiment_config
+from torchrl_sspl.configs import compose
+from torchrl_sspl.experiments.run import Experiment
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore::UserWarning")
 TINY = [
-    "trainer.total_frames=192", "trainer.optim_steps_per_batch=6", "trainer.warm_start_steps=4", "trainer.progress=false",
-    "trainer.checkpoint_every=-1", "collector.frames_per_batch=64", "collector.envs=32", "collector.init_random_frames=64",
-    "buffer.batch=32", "env.image_size=16", "network.pool_to=16", "network.barrier_hidden=[8]", "network.dynamics_hidden=[8]",
-    "network.policy_hidden=[8]",
-    *TINY_EXPERIMENT,
+    *TINY_PHASES, "env=pendulum", "trainer.total_frames=192", "trainer.optim_steps_per_batch=6", "trainer.warm_start_steps=4",
+    "trainer.checkpoint_seconds=-1", "collector.frames_per_batch=64", "collector.envs=32", "collector.init_random_frames=64",
+    "buffer.batch=32", "env.image_size=16", "network.pool_to=16", "synthesis.enabled=false",
 ]  # fmt: skip
 
 
 def train(folder, *options: str) -> Experiment:
-    words = [*TINY, *options, f"out_dir={folder}"]
-    experiment = Experiment(experiment_config(words, **{"logger.kind": "none", "evaluation.calibrate": False}))
+    experiment = Experiment(compose([*TINY, *options, f"out_dir={folder}"]))
     experiment.train()
     return experiment
 

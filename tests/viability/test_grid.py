@@ -7,10 +7,10 @@ import math
 import pytest
 import torch
 
-from torchrl_sspl.certification.ground_truth import Grid, recoverable_set, viability_kernel
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError, NonFiniteError, ShapeError
 from torchrl_sspl.sets import Box
+from torchrl_sspl.viability.grid import Grid, recoverable_set, viability_kernel
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.errors import EmptyRegionError, ShapeError
-from torchrl_sspl.objectives.latent_viability import (
+from torchrl_sspl.viability.cloud import (
     barrier_targets,
     nearby_residuals,
     nearest_distance,

@@ -1,9 +1,8 @@
-"""Experiments: exploration, episodes and what is counted on them, the level of the set, and going on after a stop."""
+"""Experiments: exploration, fresh starts, the data of the phases, mistakes and advice, and going on after a stop."""
 
 from __future__ import annotations
 
 import json
-import shutil
 from functools import partial
 from types import SimpleNamespace
 
@@ -13,24 +12,20 @@ import pytest
 import torch
 from gymnasium import spaces
 from tensordict import TensorDict
-from tiny import TINY_EXPERIMENT
+from tiny import TINY_PHASES
 from torch import nn
 
-from torchrl_sspl.certification import Certificate, Layer, Reason, Statement
+from torchrl_sspl.certification import Certificate, Layer, Statement
 from torchrl_sspl.cli import evaluate_agent
+from torchrl_sspl.configs import compose
+from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.errors import CheckpointError, ConfigError
-from torchrl_sspl.modules.agent import Agent, mlp_barrier
-from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
-from torchrl_sspl.trainers import certify as certify_module
-from torchrl_sspl.trainers import certify_on_episodes
-from torchrl_sspl.trainers.description import describe, differences
-from torchrl_sspl.trainers.episodes import Episodes, evaluate_episodes, run_episodes, separating_level
-from torchrl_sspl.trainers.experiment import Experiment, ExploringPolicy, run_experiment
-from torchrl_sspl.trainers.experiment_config import EpisodesConfig, experiment_config
-from torchrl_sspl.trainers.guidance import advice
+from torchrl_sspl.experiments.description import describe, differences
+from torchrl_sspl.experiments.guidance import advice
+from torchrl_sspl.experiments.run import Experiment, run_experiment
+from torchrl_sspl.sets import UNLABELLED
 from torchrl_sspl.trainers.hooks import RestartHook
-from torchrl_sspl.trainers.latents import LatentTraining
 from torchrl_sspl.trainers.stepper import SSPLStepper
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
@@ -75,119 +70,6 @@ class Where(nn.Module):
         return torch.cat([self.scale * x, torch.zeros_like(x)], -1)
 
 
-class Move(nn.Module):
-    def forward(self, latent: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        return latent + torch.cat([action, torch.zeros_like(action)], -1) / 16
-
-
-class Push(nn.Module):
-    def __init__(self, by: float) -> None:
-        super().__init__()
-        self.by = by
-
-    def forward(self, latent: torch.Tensor) -> torch.Tensor:
-        return torch.full_like(latent[..., :1], self.by)
-
-
-def agent(by: float, border: float = 9.4) -> Agent:
-    """B = (x - border) / 16, and a policy that always moves by the same."""
-    barrier = mlp_barrier(2, [])
-    with torch.no_grad():
-        barrier[0].weight.copy_(torch.tensor([[1.0, 0.0]]))
-        barrier[0].bias.fill_(-border / 16)
-    return Agent(Where(), Move(), barrier, Push(by), 2.0)
-
-
-def test_episodes_end_where_the_system_ends_them():
-    episodes = run_episodes(agent(3.0), lane((3,)), 5, horizon=8)
-    assert episodes.barrier.shape == (9, 5)
-    x = episodes.latent[..., 0] * 16
-    for k in range(5):
-        life = int(episodes.alive[:, k].sum())
-        assert episodes.alive[:life, k].all()
-        path = x[:life, k]
-        assert torch.allclose(path.diff().clamp_max(3.0), path.diff())
-        assert (path[:-1] <= 12).all()
-        assert path[-1] > 12
-    assert len(episodes.film) == int(episodes.alive[:, 0].sum())
-
-
-def test_prediction_errors_compare_with_what_was_seen():
-    episodes = run_episodes(agent(1.0), lane((4,)), 4, horizon=3)
-    assert episodes.prediction_error[episodes.alive[1:]].max() < 1e-5
-    off = agent(1.0)
-    off.dynamics = nn.Identity()
-    off.dynamics.forward = lambda latent, action: latent
-    wrong = run_episodes(off, lane((4,)), 4, horizon=3)
-    assert wrong.prediction_error[wrong.alive[1:]] == pytest.approx(1 / 16)
-
-
-@pytest.mark.parametrize(
-    ("border", "drawn"),
-    [
-        pytest.param(8.9, [40], id="all starts inside"),
-        pytest.param(2.4, [40] + 8 * [10], id="a quarter of them"),
-        pytest.param(-1.0, [40], id="none"),
-    ],
-)
-def test_certificates_draw_until_enough_episodes_count(border, drawn, monkeypatch):
-    asked, at_random = [], []
-
-    def counted(agent, env, n, horizon, act=None, **options):
-        (asked if act is None else at_random).append(n)
-        return run_episodes(agent, env, n, horizon, act, **options)
-
-    monkeypatch.setattr(certify_module, "run_episodes", counted)
-    certificate = certify_on_episodes(agent(0.0, border), lane, level=0.0, episodes=40, horizon=3, envs=20)
-    assert asked == drawn
-    assert sum(at_random) == 120  # three steps seldom lead into U
-    measured = certificate.layers["statistical"]
-    if border < 0:
-        assert Reason.NOT_MEASURED in measured.reasons
-    else:
-        assert measured["episodes"].n == pytest.approx(sum(drawn) * (1.0 if border > 8 else 0.25), rel=0.5)
-
-
-def test_joined_episodes_are_both():
-    first, second = (run_episodes(agent(1.0), lane((4,), seed), 4, horizon=3) for seed in (0, 1))
-    both = first.joined(second)
-    assert both.alive.shape == (4, 8)
-    assert torch.equal(both.latent[:, 4:], second.latent)
-    assert torch.equal(both.film, first.film)
-
-
-def test_measurements_count_episodes():
-    sizes = EpisodesConfig(episodes=10, envs=5, horizon=8)
-    away = evaluate_episodes(agent(3.0), lane, sizes)
-    assert away["touch_unsafe"] == away["leave"] == 1.0  # every episode drives to the end
-    assert away.measurements["touch_unsafe"].n == 10
-    still = evaluate_episodes(agent(0.0), lane, sizes)
-    assert still["touch_unsafe"] == still["leave"] == 0.0
-    assert still["unsafe_called_safe"] in (None, 0.0)  # pictures show whole numbers, so the border lies at 9.5
-    loose = evaluate_episodes(agent(3.0, border=11.5), lane, sizes)
-    assert loose["unsafe_called_safe"] > 0.0
-    tight = evaluate_episodes(agent(3.0, border=0.5), lane, sizes)
-    assert tight["starts_inside"] == 0.0
-    assert tight["touch_unsafe"] is None
-    assert tight["safe_called_unsafe"] == 1.0
-
-
-def test_the_level_keeps_held_out_observations_of_U_outside():
-    def episodes(barrier, region, alive=None):
-        value = torch.tensor(barrier)[:, None]
-        kept = torch.ones_like(value, dtype=torch.bool) if alive is None else torch.tensor(alive)[:, None]
-        codes = torch.tensor(region)[:, None]
-        return Episodes(value[..., None], value, codes, kept, value[1:], torch.zeros(1))
-
-    assert separating_level([episodes([-0.3, 0.5], [SAFE, UNSAFE])], 0.02) == 0.0  # never raised
-    assert separating_level([episodes([-0.3, -0.1], [SAFE, UNSAFE])], 0.02) == pytest.approx(-0.12)
-    assert separating_level([episodes([-0.3, -0.1], [SAFE, UNSAFE], [True, False])], 0.02) == 0.0
-    assert separating_level([episodes([-0.3, -0.1], [SAFE, UNLABELLED])], 0.02) == 0.0
-    # With a reserve: to the middle between S and U, no lower than the reserve unless U asks for it, and not for nothing.
-    for safe, unsafe, level in ((-0.2, 0.1, -0.05), (-0.4, 0.1, -0.1), (-0.4, -0.2, -0.22), (0.1, 0.2, 0.0), (0.1, 0.01, -0.01)):
-        assert separating_level([episodes([safe, unsafe], [SAFE, UNSAFE])], 0.02, 0.1) == pytest.approx(level)
-
-
 def test_exploration_is_random_in_its_share_of_the_environments():
     policy = nn.Identity()
     policy.forward = lambda td: td.set("action", torch.zeros(*td.shape, 1))
@@ -205,11 +87,9 @@ def test_exploration_is_random_in_its_share_of_the_environments():
 
 
 SMALL = [
-    "trainer.optim_steps_per_batch=2", "trainer.warm_start_steps=1", "trainer.progress=false", "trainer.checkpoint_every=0",
+    "trainer.optim_steps_per_batch=2", "trainer.warm_start_steps=1", "trainer.checkpoint_seconds=0", "trainer.restarts=0",
     "collector.frames_per_batch=64", "collector.envs=8", "collector.init_random_frames=64", "network.pool_to=8",
-    "network.barrier_hidden=[8]", "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "buffer.batch=16",
-    "evaluation.episodes=4", "evaluation.envs=4", "evaluation.horizon=4",
-    *TINY_EXPERIMENT,
+    "buffer.batch=16", "evaluation.episodes=4", "evaluation.envs=4", "evaluation.horizon=4", *TINY_PHASES,
 ]  # fmt: skip
 
 
@@ -218,7 +98,7 @@ def everywhere(batch_size, seed, below=13) -> GymnasiumPixels:
 
 
 def build(folder, *more: str) -> Experiment:
-    return Experiment(experiment_config([*SMALL, *more, f"out_dir={folder}"], **{"logger.kind": "none"}), everywhere)
+    return Experiment(compose([*SMALL, *more, f"out_dir={folder}"]), everywhere)
 
 
 class Stopped(Exception):
@@ -226,7 +106,7 @@ class Stopped(Exception):
 
 
 @pytest.mark.parametrize("restarts", [0, 1])
-def test_a_stopped_experiment_goes_on_to_the_same_agent(restarts, tmp_path, monkeypatch):
+def test_a_stopped_experiment_goes_on_to_the_same_agent(restarts, tmp_path):
     words = ["trainer.total_frames=256", f"trainer.restarts={restarts}"]
     straight = build(tmp_path / "straight", *words).train()
     first = build(tmp_path / "stopped", *words)
@@ -240,21 +120,26 @@ def test_a_stopped_experiment_goes_on_to_the_same_agent(restarts, tmp_path, monk
     with pytest.raises(Stopped):
         first.train()
     second = build(tmp_path / "stopped", *words)
+    save = second.trainer.save_trainer
 
-    def stop_in_tune(training):
-        if training.phases()[training.phase][0] == "tune":
+    def stop_in_tune(force_save=False):
+        save(force_save)
+        if second.work.where["phase"] == "tune":
             raise Stopped
 
-    with monkeypatch.context() as patch:
-        patch.setattr(LatentTraining, "_after_step", stop_in_tune)
-        with pytest.raises(Stopped):
-            second.train()
+    second.trainer.save_trainer = stop_in_tune
+    with pytest.raises(Stopped):
+        second.train()
     assert second.trainer.collected_frames == 256
     third = build(tmp_path / "stopped", *words)
     weights = third.train().state_dict()
     assert third.trainer.optimization_stepper.count == 2 * (4 - restarts)  # the fresh start forgets the first batch's steps
     for name, value in straight.state_dict().items():
         assert torch.equal(value, weights[name]), name
+
+
+def nothing() -> SimpleNamespace:
+    return SimpleNamespace(measurements={})
 
 
 def test_without_success_it_starts_again_with_other_weights_and_says_so(tmp_path):
@@ -265,14 +150,14 @@ def test_without_success_it_starts_again_with_other_weights_and_says_so(tmp_path
     experiment.train()
     assert experiment.trainer.optimization_stepper.count == 2 * 3  # batches 1, 2, 3 to 5
     assert (len(starts), len(set(starts))) == (5, 3)
-    assert any("did not tell S from U" in text for text in experiment.warnings)
+    assert any("did not tell S from U" in text for text in experiment._warnings(nothing()))
     # The same with labels that the first weights tell apart: none of it happens.
     content = build(tmp_path / "content", *words, "trainer.warm_start_error=2.5")
     content.train()
     assert content.trainer.optimization_stepper.count == 2 * 5
-    assert not any("did not tell S from U" in text for text in content.warnings)
+    assert not any("did not tell S from U" in text for text in content._warnings(nothing()))
     # A barrier that never learnt leaves no set: the level that excludes U excludes every reset, and this is said too.
-    assert any("no held-out reset lies in the set" in text for text in content.warnings)
+    assert any("no held-out reset lies in the set" in text for text in content._warnings(nothing()))
 
 
 def test_a_start_that_still_improves_is_not_given_up():
@@ -307,25 +192,6 @@ def test_a_start_that_still_improves_is_not_given_up():
         RestartHook(trainer, lambda attempt: None, after=0, most=1)
 
 
-def test_what_follows_the_joint_training_starts_anew_on_other_latents(tmp_path):
-    build(tmp_path, "trainer.total_frames=128").train()
-    longer = build(tmp_path, "trainer.total_frames=256", "optim.schedule=constant")
-    longer.train()
-    latents = torch.load(tmp_path / "synthesis" / "checkpoint.pt", weights_only=True)["latents"]
-    assert len(latents["latent"]) == 256
-    assert (tmp_path / "synthesis" / "log.jsonl").read_text().count('"phase": "teach"') == 1
-    changed = build(tmp_path, "trainer.total_frames=256", "optim.schedule=constant", "synthesis.margin=0.2")
-    with pytest.raises(ConfigError, match="another one"):
-        changed.train()
-    # An encoder trained anew in the same folder has other latents: what was trained on the old ones is not used.
-    shutil.rmtree(tmp_path / "checkpoints")
-    other = build(tmp_path, "trainer.total_frames=256", "seed=1")
-    agent = other.train()
-    seen = other.store.get(torch.arange(256))["frames"][:, :2].flatten(1, 2)
-    latents = torch.load(tmp_path / "synthesis" / "checkpoint.pt", weights_only=True)["latents"]
-    assert torch.equal(agent.encode(seen), latents["latent"])
-
-
 @pytest.mark.parametrize("never", ["safe", "unsafe"])
 def test_a_set_that_is_never_seen(never, tmp_path):
     sets = {"safe": lambda state, info: state[0] < 3, "unsafe": lambda state, info: state[0] > 10}
@@ -335,21 +201,30 @@ def test_a_set_that_is_never_seen(never, tmp_path):
         return GymnasiumPixels(Lane, batch_size=batch_size, seed=seed, image_size=16, reset_options={"below": 13}, **sets)
 
     words = [*SMALL, f"buffer.{never}=0", "trainer.total_frames=128", f"out_dir={tmp_path}"]
-    experiment = Experiment(experiment_config(words, **{"logger.kind": "none"}), env)
+    experiment = Experiment(compose(words), env)
     experiment.train()
-    assert ("0 of 128 transitions start in U" in "".join(experiment.warnings)) == (never == "unsafe")
-    assert (experiment.synthesis_dir is None) == (never == "unsafe")
+    assert ("0 of 128 transitions start in U" in "".join(experiment.work.warnings)) == (never == "unsafe")
+    assert experiment.work.skip == (never == "unsafe")
 
 
 def test_of_many_transitions_those_of_the_sets_come_first(tmp_path):
     experiment = build(tmp_path, "trainer.total_frames=256")
     experiment.train()
-    region = experiment.store.region
-    few = experiment._transitions(100)
-    assert len(few) == len(set(few.tolist())) == 100
-    labelled = int((region != UNLABELLED).sum())
-    assert int((region[few] != UNLABELLED).sum()) >= min(50, labelled) > 10
-    assert experiment._transitions(1000).tolist() == list(range(256))
+    source, region = experiment.work.source, experiment.store.region
+    few = source.stored(100)["region"][:, 0]
+    assert len(few) == 100
+    assert int((few != UNLABELLED).sum()) >= min(50, int((region != UNLABELLED).sum())) > 10
+    assert torch.equal(source.stored(1000)["region"][:, 0], region)
+
+
+def test_the_budget_counts_what_was_seen(tmp_path):
+    experiment = build(tmp_path, "trainer.total_frames=256")
+    experiment.train()
+    budget, region = experiment._budget(), experiment.store.region
+    assert budget["transitions"] == 256
+    assert budget["labels of S"] == int((region == 1).sum())
+    assert budget["labels of U"] == int((region == 2).sum())
+    assert 0 < budget["resets"] == (experiment.store.n_frames - 256) // 2
 
 
 def test_a_finished_experiment_is_not_trained_again_and_another_one_is_refused(tmp_path):
@@ -359,11 +234,10 @@ def test_a_finished_experiment_is_not_trained_again_and_another_one_is_refused(t
     assert again.trainer.optimization_stepper.count == 2 * 2
     assert all(torch.equal(value, weights[name]) for name, value in first.items())
     other = build(tmp_path, "trainer.total_frames=128", "network.barrier_hidden=[16]")
-    with pytest.raises(CheckpointError, match=r"barrier_hidden: \[8\], now \[16\]\); use another out_dir"):
+    with pytest.raises(CheckpointError, match=r"barrier_hidden: \[8, 8\], now \[16\]\); use another out_dir"):
         other.train()
     other.trainer.collector.shutdown()
-    config = experiment_config([*SMALL, "trainer.total_frames=128", f"out_dir={tmp_path}"], **{"logger.kind": "none"})
-    moved = Experiment(config, partial(everywhere, below=12))
+    moved = Experiment(compose([*SMALL, "trainer.total_frames=128", f"out_dir={tmp_path}"]), partial(everywhere, below=12))
     with pytest.raises(CheckpointError, match=r"env.*now.*use another out_dir"):
         moved.train()
     moved.trainer.collector.shutdown()
@@ -399,8 +273,8 @@ def test_descriptions_tell_systems_apart(monkeypatch):
         ({"encoder": lambda p: nn.Flatten()}, r"shape \(\*batch, network.latent_dim=3\), received \(1, 1536\)"),
         ({"encoder": lambda p: nn.Sequential(nn.Flatten(), nn.Linear(1536, p))}, "received RuntimeError.*begins with pixels.float"),
         ({"encoder": lambda p: Scaled(p, 9.0)}, r"latents in \[-1, 1\], received up to .*nn.Tanh"),
-        ({"overrides": "seed=1"}, "overrides: expected a list of key=value strings .*, received a str"),
-        ({"overrides": {"seed": 1}}, "overrides: expected a list of key=value strings .*, received a dict"),
+        ({"overrides": "seed=1"}, r"overrides: expected a list of key=value strings .*, received .* \(str\)"),
+        ({"overrides": {"seed": 1}}, r"overrides: expected a list of key=value strings .*, received .* \(dict\)"),
         ({"overrides": ["env.image_size=48"]}, "no setting of env .* received env.image_size; set it there"),
         ({"make_env": partial(lane, make=Lane())}, "make: expected a function that makes an environment"),
         ({"make_env": partial(lane, reset_options=lambda: {})}, "reset_options: expected a mapping, or a function"),
@@ -429,7 +303,7 @@ def test_advice_follows_the_reasons(tmp_path):
         layers = {
             name: Layer(name, [Statement("s", "s", "measured", not reason, reason=reason)]) for name, reason in rows.items()
         }
-        return advice(Certificate("a", "w", "c", 0.0, layers), experiment_config())
+        return advice(Certificate("a", "w", "c", 0.0, layers), compose())
 
     assert said("", "") == []
     (line,) = said("NOT_INVARIANT", "EPISODES_LEAVE")
@@ -445,11 +319,6 @@ def test_an_agent_of_a_system_in_code_is_not_measured_on_another(tmp_path):
         evaluate_agent(str(tmp_path))
 
 
-def test_certificates_say_how_long_episodes_were():
-    certificate = certify_on_episodes(agent(0.0), partial(lane, horizon=5), level=0.0, episodes=8, horizon=9, envs=4)
-    assert certificate.layers["statistical"]["episodes"].text.startswith("episodes of 5 steps")
-
-
 def test_environments_without_labels_are_refused(tmp_path):
     from torchrl_sspl.envs import PendulumEnv
 
@@ -459,4 +328,4 @@ def test_environments_without_labels_are_refused(tmp_path):
         return env
 
     with pytest.raises(ConfigError, match=r"keys pixels and region, found no \['region'\]"):
-        Experiment(experiment_config([*SMALL, f"out_dir={tmp_path}"]), unlabelled)
+        Experiment(compose([*SMALL, f"out_dir={tmp_path}"]), unlabelled)

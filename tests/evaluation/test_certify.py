@@ -1,0 +1,409 @@
+"""Certificates of closed loops that are known by hand, and of honest settings: counted right, and never refused."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+from analytic import SIDE, Line, line_agent
+from torch import Tensor, nn
+
+from torchrl_sspl.certification.branch_and_bound import Budget
+from torchrl_sspl.certification.certificate import Certificate, Reason
+from torchrl_sspl.certification.record import Counts
+from torchrl_sspl.certification.statistics import fingerprint
+from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.evaluation import blocks
+from torchrl_sspl.evaluation import certify as certify_module
+from torchrl_sspl.evaluation.blocks import described_system
+from torchrl_sspl.evaluation.certify import Exit, certify, certify_on_episodes, issue, verify_run
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.seeds import spawn
+from torchrl_sspl.sets import Box
+
+STEPS = 6
+
+
+def total(certificate: Certificate) -> Counts:
+    assert certificate.record is not None
+    return certificate.record.total
+
+
+# --- the closed loop by hand ------------------------------------------------------------------------------------------------
+
+
+def by_hand(start: list[float], law: Callable[[float], float], shown: Callable[[float], float], gain: float) -> Counts:
+    """Counts of episodes from given starts, one step after the other, in plain numbers."""
+    found = dict.fromkeys(("left", "entered", "aliased", "events", "exceeding"), 0)
+    for x in start:
+        left = entered = aliased = exceeding = False
+        for t in range(STEPS + 1):
+            z = shown(x)
+            left |= abs(z) - 0.5 > 0
+            entered |= abs(x) > 0.8
+            aliased |= abs(x) > 0.8 and abs(z) - 0.5 <= 0
+            if t == STEPS:
+                break
+            push = min(max(-2 * z, -1), 1)
+            predicted = min(max(1.8 * z + 0.6 * push, -1), 1)
+            x = law(min(max(gain * x + 0.6 * push, -1), 1))
+            exceeding |= abs(shown(x) - predicted) > 0.1326905
+        for name, value in (("left", left), ("entered", entered), ("aliased", aliased), ("exceeding", exceeding)):
+            found[name] += int(value)
+        found["events"] += int(left or entered or aliased)
+    return Counts(len(start), STEPS * len(start), undefined=0, shown=0, mistaken=0, seen=0, outside=0, **found)
+
+
+def same(x: float) -> float:
+    return x
+
+
+def jump(low: float, to: float) -> Callable[[float], float]:
+    return lambda x: to if abs(x) > low else x
+
+
+def tensor_law(law: Callable[[float], float]) -> Callable[[Tensor], Tensor]:
+    return lambda x: torch.tensor([[law(float(v))] for v in x[:, 0]], dtype=torch.float32).reshape(-1, 1)
+
+
+LOOPS: dict[str, tuple[Callable[[float], float], Callable[[float], float], float, tuple[str, ...]]] = {
+    "kept": (same, same, 1.8, ()),
+    "leaves the set": (jump(0.2, 0.6), same, 1.8, ("left", "exceeding")),
+    "enters U and stays": (jump(0.2, 0.95), same, 1.8, ("left", "entered", "exceeding")),
+    "enters U, which looks safe": (jump(0.2, 0.95), jump(0.8, 0.1), 1.8, ("entered", "aliased", "exceeding")),
+    "starts in U that look safe": (same, jump(0.8, 0.1), 1.8, ("entered", "aliased")),
+    "errors that the set survives": (same, same, 1.4, ("exceeding",)),
+    "errors that lead out": (lambda x: 1.35 * x, same, 2.4, ("left", "entered", "exceeding")),
+}
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_events_are_those_of_every_single_step(name, monkeypatch):
+    law, shown, gain, expected = LOOPS[name]
+    starts: list[Tensor] = []
+    simulate = blocks.simulate
+
+    def seen(controller: Any, env: Any, *, start: Tensor, **options: Any) -> Any:
+        starts.append(start)
+        return simulate(controller, env, start=start, **options)
+
+    monkeypatch.setattr(blocks, "simulate", seen)
+    env = Line(tensor_law(law), tensor_law(shown), gain=gain)
+    certificate = certify(line_agent(), env, episodes=300, horizon=STEPS)
+    found, hand = total(certificate), by_hand(torch.cat(starts)[:, 0].tolist(), law, shown, gain)
+    for field in ("episodes", "steps", "left", "entered", "aliased", "events", "exceeding"):
+        # The picture has 16 bits: who starts within one of them of a border may fall on either side.
+        assert abs(getattr(found, field) - getattr(hand, field)) <= 1, (field, found, hand)
+    assert {k for k in ("left", "entered", "aliased", "exceeding") if getattr(found, k)} == set(expected)
+    assert (found.mistaken > 0) == (shown is not same)
+    if "left" in expected or "entered" in expected:
+        layer = certificate.layers["statistical"]
+        assert not layer.holds
+        assert layer["episodes"].reason == ("UNSAFE_ENTERED" if "entered" in expected else "EPISODES_LEAVE")
+
+
+def test_a_system_in_which_every_episode_enters_u_and_stays_is_refused():
+    # Nobody leaves {B <= 0} by what the pictures show.
+    env = Line(law=lambda x: torch.full_like(x, 0.9), shown=lambda x: torch.where(x.abs() > 0.8, 0.1, x))
+    certificate = certify(line_agent(), env, episodes=400, horizon=3)
+    found = total(certificate)
+    assert (found.left, found.entered, found.aliased, found.events) == (0, 400, 400, 400)
+    assert certificate.layers["statistical"]["episodes"].value == 1.0
+    assert Reason.UNSAFE_ENTERED in certificate.layers["statistical"].reasons
+
+
+def test_half_of_the_observations_of_u_are_where_it_is_entered():
+    # Only what one step can reach looks safe: |x| <= 1.8 * 0.8 is all of U here, so a thin rim is told by the step before.
+    agent, env = line_agent(), Line(gain=1.0, shown=lambda x: torch.where((x.abs() > 0.8) & (x.abs() <= 0.805), 0.1, x))
+    certificate = certify(agent, env, episodes=500, horizon=1)
+    found = total(certificate)
+    uniform = 250 * 0.005 / 0.2  # expected among the first half
+    assert found.shown == 500
+    assert found.mistaken > 1.2 * uniform / 2  # the other half adds those that enter it
+
+
+class Blind(nn.Module):
+    """Gives no number for some pictures."""
+
+    def __init__(self, reader: nn.Module, above: float) -> None:
+        super().__init__()
+        self.reader, self.above = reader, above
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        z = self.reader(pixels)
+        return torch.where(z[..., :1] > self.above, torch.nan, z)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_no_number_is_an_event_and_no_way_to_stay_inside(known):
+    agent = line_agent()
+    blind = Agent(Blind(agent.encoder, 0.55), agent.dynamics, agent.barrier, agent.policy, 1.5, agent.description)
+    law = partial(torch.where, torch.tensor(True), torch.tensor(0.7))  # every step leads to 0.7
+    if known:
+        certificate = certify(blind, Line(law=lambda x: law(x) + 0 * x), episodes=50, horizon=3)
+    else:
+        make = partial(Line, lambda x: law(x) + 0 * x, initial=0.4)
+        certificate = certify_on_episodes(blind, make, episodes=50, horizon=3, envs=10)
+    found = total(certificate)
+    assert found.undefined == found.events == found.episodes >= 50
+    layer = certificate.layers["statistical"]
+    assert layer["finite"].reason == "NOT_FINITE"
+    assert layer["episodes"].value == 1.0
+    assert Certificate.from_dict(json.loads(json.dumps(certificate.to_dict(), allow_nan=False))) == certificate
+
+
+# --- an environment's own resets --------------------------------------------------------------------------------------------
+
+
+class Stuck(Line):
+    """Every reset begins at the same place."""
+
+    def sample_states(self, n: int, *args: Any, **options: Any) -> Tensor:
+        return torch.full((n, 1), 0.25)
+
+
+def test_copies_of_one_episode_are_not_independent():
+    certificate = certify_on_episodes(line_agent(), Stuck, episodes=100, horizon=3, envs=10)
+    record, layer = certificate.record, certificate.layers["statistical"]
+    assert record is not None
+    assert record.sizes["repeated"] == record.total.episodes - 1 >= 99
+    assert layer["different"].reason == "CALIBRATION_REUSED"
+    assert layer["episodes"].n == 1
+
+
+class StuckOften(Line):
+    """One reset in four begins at the same place, and some lie in U."""
+
+    def sample_states(self, n: int, generator: Any = None, **options: Any) -> Tensor:
+        state = super().sample_states(n, generator, **options)
+        return torch.where(torch.arange(n)[:, None] % 4 == 0, 0.25, state)
+
+
+def test_a_quarter_of_copies_is_refused():
+    certificate = certify_on_episodes(line_agent(), StuckOften, episodes=80, horizon=3, envs=8)
+    assert Reason.CALIBRATION_REUSED in certificate.layers["statistical"].reasons
+
+
+def test_states_on_a_line_do_not_collide_falsely():
+    for seed in (0, 1):
+        certificate = certify(line_agent(), Line(), episodes=1000, horizon=1, seed=seed)
+        assert Reason.CALIBRATION_REUSED not in certificate.reasons
+        record = certificate.record
+        assert record is not None
+        assert certificate.layers["statistical"]["episodes"].n == 1000 - record.sizes["repeated"]
+
+
+def test_episodes_end_where_the_environment_ends_them():
+    make = partial(Line, initial=0.9, horizon=2)
+    record = certify_on_episodes(line_agent(), make, episodes=40, horizon=9, envs=8).record
+    assert record is not None
+    assert [record.sizes[k] for k in ("shortest", "median", "longest")] == [2, 2, 2]
+    assert record.total.steps == 2 * record.total.episodes
+    assert record.total.episodes < 0.75 * len(record.blocks) * record.block  # five in nine begin in the set
+
+
+def test_blocks_of_resets_are_different_episodes():
+    record = certify_on_episodes(line_agent(), partial(Line, initial=0.4), episodes=250, horizon=1, envs=50).record
+    assert record is not None
+    assert len(record.blocks) >= 3
+    assert record.total.episodes == 100 * len(record.blocks)
+    assert record.sizes["repeated"] <= 4
+
+
+def test_resets_show_what_the_camera_hides():
+    make = partial(Line, shown=lambda x: torch.where(x.abs() > 0.8, 0.1, x))
+    certificate = certify_on_episodes(line_agent(), make, episodes=60, horizon=2, envs=20)
+    found = total(certificate)
+    assert found.shown == found.mistaken > 20
+    assert found.entered == found.aliased > 0  # they begin in U and look safe
+    assert certificate.layers["statistical"]["unsafe observations"].reason == "UNSAFE_INSIDE"
+
+
+# --- what was used before ---------------------------------------------------------------------------------------------------
+
+
+def test_seeds_of_the_training_are_found():
+    root = line_agent().description["config"]["seed"]
+    block = spawn(root, "certificate", 0)
+    for options in ({"seeds": [root, block]}, {"seeds": [root, block + 2**32]}):
+        certificate = certify(line_agent(**options), Line(), episodes=20, horizon=1)
+        assert Reason.CALIBRATION_REUSED in certificate.reasons
+    certificate = certify(line_agent(), Line(), episodes=20, horizon=1, used_seeds=[block])
+    assert Reason.CALIBRATION_REUSED in certificate.reasons
+    assert Reason.CALIBRATION_REUSED not in certify(line_agent(), Line(), episodes=20, horizon=1).reasons
+    # The seed of the run itself is no seed of its certificate.
+    assert Reason.CALIBRATION_REUSED not in certify(line_agent(), Line(), episodes=20, horizon=1, seed=root).reasons
+
+
+def test_an_agent_that_does_not_say_its_seeds_is_told_so():
+    agent = line_agent()
+    del agent.description["seeds"]
+    fresh = certify(agent, Line(), episodes=20, horizon=1).layers["statistical"]["fresh"]
+    assert fresh.kind == "assumed"
+    assert "does not say" in fresh.text
+
+
+def test_labelled_states_of_the_training_are_found(monkeypatch):
+    seen: list[str] = []
+    block = blocks.Block
+
+    def kept(*values: Any) -> Any:
+        made = block(*values)
+        seen.extend(made.labelled)
+        return made
+
+    monkeypatch.setattr(blocks, "Block", kept)
+    certify(line_agent(), Line(), episodes=200, horizon=1)
+    foreign = fingerprint(torch.rand(500, 1) + 5)
+    leaked = certify(line_agent(trained_on=seen[:100] + foreign), Line(), episodes=200, horizon=1)
+    assert Reason.LABELS_LEAKED in leaked.reasons
+    some = certify(line_agent(trained_on=seen[:5] + foreign), Line(), episodes=200, horizon=1).layers["statistical"]
+    assert Reason.LABELS_LEAKED not in some.reasons
+    assert some["unsafe observations"].n == 195
+
+
+# --- honest certificates are never refused ----------------------------------------------------------------------------------
+
+POOL: dict[str, dict[str, Any]] = {
+    "as it is": {},
+    "one episode": {"episodes": 1, "horizon": 1},
+    "episodes of a block and one": {"episodes": 251, "horizon": 1},
+    "long episodes": {"episodes": 20, "horizon": 40},
+    "another seed": {"seed": 99},
+    "a large seed": {"seed": 2**40},
+    "another level": {"level": -0.1},
+    "a level that is not kept": {"level": -0.499},
+    "an empty set": {"level": -0.6},
+    "another confidence": {"confidence": 0.5},
+    "another acceptable risk": {"acceptable": 0.4},
+    "another name": {"name": "run_7 (of 8), [x] <b>"},
+    "more seeds": {"used_seeds": [5, 6, -7]},
+    "no time": {"budget": Budget(seconds=0.0)},
+    "no boxes": {"budget": Budget(boxes=0)},
+    "a few boxes": {"budget": Budget(boxes=50)},
+    "some boxes": {"budget": Budget(boxes=600)},
+    "nothing measured": {"env": None},
+    "a system that leaves": {"env": Line(law=lambda x: torch.where(x > 0.2, 0.6, x)), "acceptable": 0.9},
+    "a system that enters U": {"env": Line(law=lambda x: torch.where(x > 0.2, 0.9, x))},
+    "a camera that lies": {"env": Line(shown=lambda x: torch.where(x > 0.8, 0.2, x))},
+}
+
+
+@pytest.mark.parametrize("name", POOL)
+def test_an_honest_certificate_is_found_again(name, tmp_path):
+    options = {"env": Line(), "episodes": 60, "horizon": 3, "name": "line"} | POOL[name]
+    env = options.pop("env")
+    agent = line_agent()
+    directory = tmp_path / "another folder" / "pendulum"
+    agent.save(directory)
+    certify(agent, env, **options).save(directory / "certificate.json")
+    lines: list[str] = []
+    assert verify_run(directory, env=env, report=lines.append) == Exit.HOLDS, "\n".join(lines)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"initial": 0.3},
+        {"initial": 0.9, "horizon": 2},
+        {"law": lambda x: torch.where(x > 0.2, 0.9, x)},
+        {"seed": 5},
+        {"envs": 7},
+        {"confidence": 0.8, "acceptable": 0.3},
+        {"budget": Budget(seconds=0.0)},
+    ],
+)
+def test_an_honest_certificate_of_resets_is_found_again(options, tmp_path):
+    of_env = {k: options[k] for k in ("initial", "horizon", "law") if k in options}
+    settings = {"episodes": 40, "horizon": 4, "envs": 8} | {k: v for k, v in options.items() if k not in of_env}
+    agent, make = line_agent(), partial(Line, **({"initial": 0.7} | of_env))
+    agent.save(tmp_path)
+    certify_on_episodes(agent, make, name="line", **settings).save(tmp_path / "certificate.json")
+    lines: list[str] = []
+    assert verify_run(tmp_path, env=make, report=lines.append) == Exit.HOLDS, "\n".join(lines)
+
+
+def test_a_slow_machine_that_verifies_says_that_the_time_was_short(tmp_path, monkeypatch):
+    agent = line_agent()
+    agent.save(tmp_path)
+    certify(agent, None, name="line").save(tmp_path / "certificate.json")
+    proof = certify_module._proof
+    monkeypatch.setattr(certify_module, "_proof", lambda agent, level, budget: proof(agent, level, replace(budget, boxes=20)))
+    lines: list[str] = []
+    assert verify_run(tmp_path, report=lines.append) == Exit.TIME
+    assert any("UNDECIDED" in line for line in lines)
+
+
+def test_part_of_the_blocks_is_said_to_be_a_part(tmp_path, monkeypatch):
+    agent = line_agent()
+    agent.save(tmp_path)
+    certify(agent, Line(), name="line", episodes=600, horizon=1).save(tmp_path / "certificate.json")
+    ticks = iter(range(0, 10_000, 18))
+    monkeypatch.setattr(certify_module, "time", SimpleNamespace(monotonic=lambda: float(next(ticks))))
+    lines: list[str] = []
+    assert verify_run(tmp_path, env=Line(), report=lines.append) == Exit.HOLDS
+    text = "\n".join(lines)
+    assert "1 of 3 blocks" in text
+    assert "    measured" not in text[text.index("statistical") :]
+
+
+def test_a_certificate_is_issued_again_with_its_own_settings(tmp_path):
+    agent = line_agent()
+    agent.save(tmp_path / "agent")
+    certify(agent, Line(), name="line", episodes=30, horizon=2, seed=4, acceptable=0.3).save(tmp_path / "agent" / "certificate.json")
+    before = (tmp_path / "agent" / "certificate.json").read_text()
+    issue(tmp_path, Line())
+    assert (tmp_path / "agent" / "certificate.json").read_text() == before
+    assert issue(tmp_path, Line(), seed=5).record.seed == 5
+    (tmp_path / "agent" / "certificate.json").unlink()
+    assert issue(tmp_path).agent == tmp_path.name.replace("[", "_").replace("]", "_")
+
+
+# --- which system -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_system_of_a_description_is_one_of_the_library():
+    named = described_system({"config": {"env": {"_target_": "torchrl_sspl.envs.PendulumEnv", "max_torque": 5.0}}})
+    assert named is not None
+    assert named([1], 0).max_action == 5.0
+    for target in ("os.mkdir", "torchrl_sspl.envs.gymnasium.GymnasiumPixels", "torchrl_sspl.envs:Sequence", "torchrl_sspl.cli:main", 5, None):
+        assert described_system({"config": {"env": {"_target_": target}}}) is None
+    for broken in ({}, {"config": 7}, {"config": {"env": []}}, {"environment": 3}, {"environment": "../x"}, {"environment": "NoEnv"},
+                   {"config": {"env": {"_target_": "torchrl_sspl.envs.PendulumEnv", "colour": 1}}}):  # fmt: skip
+        assert described_system(broken) is None
+
+
+@pytest.mark.parametrize(
+    ("env", "same_one"),
+    [
+        (PendulumEnv(batch_size=[1]), True),
+        (PendulumEnv(batch_size=[3]), True),
+        (PendulumEnv(batch_size=[1], max_torque=5.0), False),
+        (PendulumEnv(batch_size=[1], image_size=32), False),
+        (PendulumEnv(batch_size=[1], integrator="explicit"), False),
+        (DubinsEnv(batch_size=[1]), False),
+    ],
+)
+def test_a_system_is_compared_with_its_description(env, same_one):
+    assert blocks.same_system(env, PendulumEnv(batch_size=[1])) == same_one
+
+
+def test_resets_are_compared_with_their_description():
+    assert blocks.same_resets(partial(Line, initial=0.5), partial(Line, initial=0.5))
+    assert not blocks.same_resets(partial(Line, initial=0.5), Line)
+    assert not blocks.same_resets(Line, lambda batch_size, seed: object())
+
+
+def test_the_line_is_what_it_says():
+    env = Line()
+    assert env.observation_spec["pixels"].shape[-1] == SIDE
+    assert isinstance(env.state_space, Box)
+    assert Path(__file__).exists()

@@ -1,0 +1,234 @@
+"""Phases on frozen latents: they resume exactly, can be left out or added to, and keep only what passed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from tensordict import TensorDict
+from tiny import TINY
+from torch import nn
+
+from torchrl_sspl.configs import compose
+from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.experiments.run import Experiment
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.trainers import Check, CheckRound, InnerLoop, Phase, Phases, Workspace, synthesis_phases
+from torchrl_sspl.trainers.synthesis import action_grid
+
+pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:init_random_frames")
+
+
+def experiment(path: Path, *overrides: str) -> Experiment:
+    return Experiment(compose([*TINY, *overrides, f"out_dir={path}"]))
+
+
+class Killed(Exception):
+    pass
+
+
+def killed_after(found: Experiment, checkpoints: int) -> None:
+    """Lets a training die right after its n-th checkpoint, as a killed process would."""
+    left, save = [checkpoints], found.trainer._save_trainer
+
+    def save_and_die() -> None:
+        save()
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+
+    found.trainer._save_trainer = save_and_die  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        found.train()
+
+
+def assert_same(one: nn.Module, other: nn.Module) -> None:
+    expected = other.state_dict()
+    for name, value in one.state_dict().items():
+        assert torch.equal(value, expected[name]), name
+
+
+EVERY_STEP = "trainer.checkpoint_seconds=0"
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    found = experiment(tmp_path_factory.mktemp("whole"))
+    return found, found.train()
+
+
+@pytest.mark.parametrize("checkpoints", [1, 2, 3, 4, 8, 13, 21, 27])
+def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkpoints):
+    whole, expected = uninterrupted
+    killed_after(experiment(tmp_path, EVERY_STEP), checkpoints)
+    resumed = experiment(tmp_path, EVERY_STEP)
+    assert_same(resumed.train(), expected)
+    assert resumed.work.checks == whole.work.checks
+    assert resumed.work.level == whole.work.level
+    assert resumed.work.source.budget == whole.work.source.budget
+    assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
+
+
+@pytest.mark.parametrize("checkpoints", [3, 15])
+def test_what_was_logged_after_the_last_checkpoint_is_not_logged_twice(tmp_path, uninterrupted, checkpoints):
+    found = experiment(tmp_path, EVERY_STEP)
+    left, save, log = [checkpoints], found.trainer._save_trainer, tmp_path / "log.jsonl"
+
+    def die_in_place_of_saving() -> None:
+        left[0] -= 1
+        if left[0] == 0:
+            log.write_text(log.read_text() + '{"phase": "half a li')
+            raise Killed
+        save()
+
+    found.trainer._save_trainer = die_in_place_of_saving  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        found.train()
+    experiment(tmp_path, EVERY_STEP).train()
+    assert log.read_text() == (uninterrupted[0].directory / "log.jsonl").read_text()
+
+
+def test_a_policy_that_is_taught_first_continues_bit_for_bit_too(tmp_path):
+    value = "synthesis.teacher=value"
+    expected = experiment(tmp_path / "whole", value).train()
+    killed_after(experiment(tmp_path / "killed", value, EVERY_STEP), 14)
+    assert_same(experiment(tmp_path / "killed", value, EVERY_STEP).train(), expected)
+
+
+def test_inside_the_phases_checkpoints_hold_no_pictures(tmp_path):
+    killed_after(experiment(tmp_path, EVERY_STEP), 12)
+    newest = max((tmp_path / "checkpoints").iterdir(), key=lambda path: path.name)
+    held = json.loads(next(newest.glob("*.json")).read_text())["components"]
+    assert "loss_module" in held
+    assert "replay_buffer" not in held
+
+
+def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
+    other = experiment(tmp_path, "seed=1").train()
+    with pytest.raises(AssertionError):
+        assert_same(other, uninterrupted[1])
+
+
+def test_a_checkpoint_of_other_settings_is_refused(uninterrupted):
+    path = uninterrupted[0].directory
+    with pytest.raises(CheckpointError, match=r"synthesis\.margin: 0\.05, now 0\.07"):
+        experiment(path, "synthesis.margin=0.07").train()
+    assert experiment(path, "trainer.progress=false", "evaluation.seed=3").train() is not None  # these may change
+
+
+def test_an_unreadable_checkpoint_is_named(tmp_path):
+    killed_after(experiment(tmp_path, EVERY_STEP), 2)
+    for file in (tmp_path / "checkpoints").rglob("*.json"):
+        if file.parent.parent.name == "components":
+            file.write_text("{")
+    with pytest.raises(CheckpointError, match="expected a checkpoint of this trainer"):
+        experiment(tmp_path).train()
+
+
+def test_the_written_agent_is_the_returned_one(uninterrupted):
+    found, agent = uninterrupted
+    assert_same(Agent.load(found.directory / "agent"), agent)
+    body = json.loads((found.directory / "agent" / "agent.json").read_text())
+    assert body["config"]["seed"] == 0
+    assert "out_dir" not in body["config"]
+
+
+def test_every_line_of_the_log_names_its_phase(uninterrupted):
+    rows = [json.loads(line) for line in (uninterrupted[0].directory / "log.jsonl").read_text().splitlines()]
+    assert {"joint", "dynamics", "fit", "steer", "tune", "check"} <= {row["phase"] for row in rows}
+    assert {row["round"] for row in rows} == {0, 1}
+
+
+def test_growth_is_never_paid_for_with_invariance():
+    """A larger set that fails its checks is not kept; among those that pass, one to which U returns comes first."""
+    work = Workspace(nn.Identity(), *_networks())
+    assert work.best is None
+    kept = []
+    for number, (size, returned, passed) in enumerate([(0.2, 1.0, True), (0.9, 1.0, False), (0.5, 0.1, True), (0.3, 1.0, True)]):
+        check = CheckRound(number)
+        found = Check(number, 0.0, 0, 0, 0, 0, returned, size, passed, "")
+        check._held_out = lambda work, agent: object()  # type: ignore[assignment, method-assign, return-value]
+        check._check = lambda work, held_out, level, found=found: found  # type: ignore[method-assign]
+        check.run(work)
+        kept.append(work.best["round"])
+    assert kept == [0, 0, 0, 3]
+
+
+def test_the_level_moves_the_last_bias(uninterrupted):
+    work = uninterrupted[0].work
+    low, high = work.agent(-0.1), work.agent(0.05)
+    z = torch.zeros(1, work.latent_dim)
+    assert float(low.barrier(z) - high.barrier(z)) == pytest.approx(0.15, abs=1e-6)
+
+
+def _networks():
+    from torchrl_sspl.lipschitz import SandwichBarrier
+    from torchrl_sspl.modules import LatentDynamics, Policy
+
+    torch.manual_seed(0)
+    return LatentDynamics(2, 1, (8,)), SandwichBarrier(2, (8,)), Policy(2, 1, (8,))
+
+
+class Count(Phase):
+    name = "count"
+
+    def run(self, work):
+        self.seen = int(work.unsafe().sum())
+
+
+def test_phases_can_be_left_out_and_added_to(tmp_path, uninterrupted):
+    source = uninterrupted[0].work.source
+    config = compose([*TINY, "synthesis.rounds=1"]).synthesis
+    counted = Count()
+    phases = [phase for phase in synthesis_phases(config) if phase.name not in ("steer", "tune")]
+    dynamics, barrier, policy = [m for m in (uninterrupted[0].dynamics, uninterrupted[0].barrier, uninterrupted[0].policy)]
+    before = {k: v.clone() for k, v in barrier.state_dict().items()}
+    work = Workspace(source.encoder, dynamics, barrier, policy, config=config, source=source)
+    run = Phases([phases[0], counted, *phases[1:]], work)
+    run.run()  # without any trainer
+    assert run.finished
+    assert counted.seen > 0
+    assert any(not torch.equal(before[k], v) for k, v in barrier.state_dict().items())  # the weights are back where they belong
+    barrier.load_state_dict(before)
+
+
+def test_where_U_is_never_seen_nothing_is_synthesised(tmp_path, monkeypatch):
+    found = experiment(tmp_path, "synthesis.rounds=1")
+    monkeypatch.setattr(type(found.work), "unsafe", lambda self: torch.zeros(len(self.latents["latent"]), dtype=torch.bool))
+    found.train()
+    assert any("what follows needs both kinds" in text for text in found.work.warnings)
+    assert not found.work.checks
+
+
+def test_a_loss_that_is_not_finite_stops_the_phase():
+    layer, loop = nn.Linear(1, 1), InnerLoop(seed=0)
+    with pytest.raises(ConfigError, match="expected finite losses"):
+        loop(5, {layer: 1e-3}, lambda: TensorDict(loss_bad=layer.weight.sum() * float("nan")))
+
+
+@pytest.mark.parametrize(("dimensions", "per_dimension"), [(1, 21), (2, 21), (4, 7), (8, 7)])
+def test_the_grid_of_actions_gets_coarser_with_their_dimension(dimensions, per_dimension):
+    grid = action_grid([1.0] * dimensions, per_dimension)
+    assert len(grid) <= 8 * 729
+    assert grid.shape[1] == dimensions
+    assert bool((grid.amax(0) == 1).all())
+
+
+def test_too_many_dimensions_of_the_action_are_named():
+    with pytest.raises(ConfigError, match="action dimensions"):
+        action_grid([1.0] * 40, 2)
+
+
+def test_an_unknown_teacher_is_named():
+    with pytest.raises(ConfigError, match=r"synthesis\.teacher"):
+        compose(["synthesis.teacher=nobody"])
+
+
+def test_training_sees_no_state(uninterrupted):
+    """The phases work on latents of pictures, actions and labels; the store of the joint training holds no states."""
+    found = uninterrupted[0]
+    assert set(found.work.latents) == {"latent", "next_latent", "action", "region"}
+    assert ("info", "state") not in found.store.get(torch.arange(2)).keys(True)
+    assert not found.store.keep_state
