@@ -17,6 +17,7 @@ import torch
 from analytic import SIDE, Line, line_agent
 from safetensors.torch import load_file, save_file
 
+from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate, Reason, configuration_digest, weights_digest
 from torchrl_sspl.certification.record import Record
 from torchrl_sspl.certification.statistics import paper_layer, statistical_layer
@@ -101,7 +102,8 @@ def regenerated(change: Callable[[Body], None]) -> Callable[[Body], None]:
     def forge(body: Body) -> None:
         change(body["record"])
         record = Record.from_dict(body["record"])
-        tolerated = statement(body, "tolerated error")["value"]
+        found = (s["value"] for s in body["layers"]["deterministic"]["statements"] if s["name"] == "tolerated error")
+        tolerated = next(found, None)
         layers = statistical_layer(record, level=body["level"], tolerated_error=tolerated), paper_layer(record, 1.5)
         for layer in layers:
             body["layers"][layer.name] = json.loads(json.dumps({"name": layer.name, "statements": [vars(s) for s in layer.statements], "verdict": layer.verdict}))
@@ -289,7 +291,9 @@ def test_a_barrier_that_hovers_hides_no_events(scale, tmp_path):
     agent.barrier[-1].weight.data.mul_(scale)
     agent.barrier[-1].bias.data.mul_(scale)
     agent.save(tmp_path)
-    certify(agent, env, name="line", level=0.0, episodes=40, horizon=2, acceptable=0.9).save(tmp_path / "certificate.json")
+    certify(agent, env, name="line", level=0.0, episodes=40, horizon=2, acceptable=0.9, budget=Budget(boxes=20_000)).save(
+        tmp_path / "certificate.json"
+    )
     body = read(tmp_path)
     assert body["record"]["blocks"][0]["left"] == 40
     regenerated(lambda r: r["blocks"][0].update(left=0, events=0))(body)
