@@ -252,7 +252,7 @@ if griffe is not None:
                 return
             text = to_markdown(obj.docstring.value)
             text = re.sub(r"^( *)Example:$", r"\1Examples:", text, flags=re.MULTILINE)
-            text = re.sub(r"^( *)Source: ", r"\1**Source:** ", text, flags=re.MULTILINE)
+            text = re.sub(r"(^ *|[.)] )Source: ", r"\1**Source:** ", text, flags=re.MULTILINE)
             obj.docstring.value = text
 
 

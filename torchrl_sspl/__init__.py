@@ -20,9 +20,7 @@ __version__ = "0.1.0"
 # A name and a path: nothing of the simulator is loaded before the environment is made.
 if "SSPL/QuadrupedObstacle-v0" not in gymnasium.registry:
     gymnasium.register(
-        id="SSPL/QuadrupedObstacle-v0",
-        entry_point="torchrl_sspl.envs.quadruped.env:QuadrupedEnv",
-        max_episode_steps=80,
+        id="SSPL/QuadrupedObstacle-v0", entry_point="torchrl_sspl.envs.quadruped.env:QuadrupedEnv", max_episode_steps=80
     )
 
 _SUBPACKAGES = (

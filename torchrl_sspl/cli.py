@@ -44,9 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Args:
         arguments: words after ``sspl``; by default those of the command line.
 
-    Returns:
-        0; 1 if a verification or a run of several fails; 2 for a wrong argument, with the reason on standard error.
-
+    Returns 0; 1 if a verification or a run of several fails; 2 for a wrong argument, with the reason on standard error.
     Source: none.
 
     Example:
@@ -90,13 +88,8 @@ def train(words: list[str]) -> int:
     Args:
         words: ``key=value`` and options, or ``--help``.
 
-    Returns:
-        0, or 1 where one of several runs failed.
-
-    Raises:
-        ConfigError: if an option, a key or a value is not valid; before anything is computed.
-
-    Source: paper, Algorithm 1.
+    Returns 0, or 1 where one of several runs failed. Raises ConfigError if an option, a key or a value is not valid;
+    before anything is computed. Source: paper, Algorithm 1.
     """
     overrides, options = _options(words)
     if options.keys() & {"--launcher", "--jobs"} and "--multirun" not in options:
@@ -180,14 +173,8 @@ def evaluate(words: list[str]) -> int:
     Args:
         words: name of a shipped agent or a run directory, and ``key=value`` for the fields of its evaluation.
 
-    Returns:
-        0.
-
-    Raises:
-        CheckpointError: if there is no such agent, or its environment is not known.
-        ConfigError: if a key or a value is not valid.
-
-    Source: none.
+    Returns 0. Raises CheckpointError if there is no such agent, or its environment is not known; ConfigError if a key
+    or a value is not valid. Source: none.
     """
     parser = argparse.ArgumentParser(prog="sspl evaluate", description="Measure an agent on fresh data.", allow_abbrev=False)
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
@@ -214,14 +201,8 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
         overrides: ``key=value`` for the fields of ``EvaluationConfig``.
         device: device of the networks.
 
-    Returns:
-        The measurements.
-
-    Raises:
-        CheckpointError: if there is no such agent, or its environment is not known.
-        ConfigError: if a key or a value is not valid.
-
-    Source: none.
+    Returns the measurements. Raises CheckpointError if there is no such agent, or its environment is not known;
+    ConfigError if a key or a value is not valid. Source: none.
     """
     from torchrl_sspl.configs.reader import EnvFactory, change, from_dict
     from torchrl_sspl.envs.base import SafetyEnv
@@ -258,14 +239,9 @@ def verify(words: list[str]) -> int:
     Args:
         words: name of a shipped agent or a run directory, and options.
 
-    Returns:
-        0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no certificate or the file is
-        none, 4 if the agent cannot be read, 5 if the time was too short.
-
-    Raises:
-        CheckpointError: if there is no such agent.
-
-    Source: none.
+    Returns 0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no certificate or
+    the file is none, 4 if the agent cannot be read, 5 if the time was too short. Raises CheckpointError if there is no
+    such agent. Source: none.
     """
     parser = argparse.ArgumentParser(prog="sspl verify", description="Check the certificates of an agent again.")
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
@@ -284,13 +260,7 @@ def compare(words: list[str]) -> int:
     Args:
         words: directories of runs.
 
-    Returns:
-        0.
-
-    Raises:
-        CheckpointError: if none of them is a run that has come to an end.
-
-    Source: none.
+    Returns 0. Raises CheckpointError if none of them is a run that has come to an end. Source: none.
     """
     parser = argparse.ArgumentParser(prog="sspl compare", description="Runs beside each other, on one page.")
     parser.add_argument("runs", nargs="+", metavar="RUN", help="directories of runs; other files are passed over")

@@ -13,13 +13,7 @@ def usable_device(name: torch.device | str) -> torch.device:
     Args:
         name: such as ``"cpu"``, ``"cuda"`` or ``"cuda:1"``.
 
-    Returns:
-        The device.
-
-    Raises:
-        ConfigError: if there is no such device here.
-
-    Source: none.
+    Returns the device. Raises ConfigError if there is no such device here. Source: none.
 
     Example:
         >>> usable_device("cpu")

@@ -25,10 +25,7 @@ def safe_hinge(barrier: Tensor, safety_margin: Scalar) -> Tensor:
         barrier: ``(*batch, 1)``.
         safety_margin: :math:`\psi`, in units of the barrier.
 
-    Returns:
-        ``(*batch, 1)``.
-
-    Source: paper eq. (8), first term.
+    Returns ``(*batch, 1)``. Source: paper eq. (8), first term.
 
     Example:
         >>> safe_hinge(torch.tensor([[-1.0], [0.5]]), 0.25).flatten().tolist()
@@ -44,10 +41,7 @@ def unsafe_hinge(barrier: Tensor, safety_margin: Scalar) -> Tensor:
         barrier: ``(*batch, 1)``.
         safety_margin: :math:`\psi`, in units of the barrier.
 
-    Returns:
-        ``(*batch, 1)``.
-
-    Source: paper eq. (8), second term.
+    Returns ``(*batch, 1)``. Source: paper eq. (8), second term.
 
     Example:
         >>> unsafe_hinge(torch.tensor([[1.0], [-0.5]]), 0.25).flatten().tolist()
@@ -63,13 +57,7 @@ def consistency_error(predicted: Tensor, target: Tensor) -> Tensor:
         predicted: ``(*batch, p)``.
         target: ``(*batch, p)``.
 
-    Returns:
-        ``(*batch, 1)``.
-
-    Raises:
-        ShapeError: if the shapes differ.
-
-    Source: paper eq. (8), third term.
+    Returns ``(*batch, 1)``. Raises ShapeError if the shapes differ. Source: paper eq. (8), third term.
 
     Example:
         >>> consistency_error(torch.tensor([[3.0, 0.0]]), torch.tensor([[0.0, 4.0]]))
@@ -86,13 +74,7 @@ def dynamics_error(predicted: Tensor, actual: Tensor) -> Tensor:
         predicted: ``(*batch, p)``.
         actual: ``(*batch, p)``.
 
-    Returns:
-        ``(*batch,)``.
-
-    Raises:
-        ShapeError: if the shapes differ.
-
-    Source: paper Theorem 2.
+    Returns ``(*batch,)``. Raises ShapeError if the shapes differ. Source: paper Theorem 2.
 
     Example:
         >>> dynamics_error(torch.tensor([[3.0, 0.0]]), torch.tensor([[0.0, 4.0]]))
@@ -138,14 +120,8 @@ def synthesis_violation(
         floor: c of R2.
         band: b of R3.
 
-    Returns:
-        ``(*batch, 1)``.
-
-    Raises:
-        ConfigError: if the mode is unknown.
-        ShapeError: if the shapes differ.
-
-    Source: paper eq. (10) in mode "paper"; the other modes are deviations.
+    Returns ``(*batch, 1)``. Raises ConfigError if the mode is unknown; ShapeError if the shapes differ. Source: paper
+    eq. (10) in mode "paper"; the other modes are deviations.
 
     Example:
         >>> synthesis_violation(torch.tensor([[0.0]]), torch.tensor([[0.2]]), mode="R3", dynamics_margin=0.1)
@@ -172,13 +148,7 @@ def policy_deviation(action: Tensor, action_user: Tensor) -> Tensor:
         action: ``(*batch, m)``, physical units.
         action_user: ``(*batch, m)``, physical units.
 
-    Returns:
-        ``(*batch, 1)``.
-
-    Raises:
-        ShapeError: if the shapes differ.
-
-    Source: paper eq. (13).
+    Returns ``(*batch, 1)``. Raises ShapeError if the shapes differ. Source: paper eq. (13).
 
     Example:
         >>> policy_deviation(torch.tensor([[3.0, 4.0]]), torch.zeros(1, 2))
@@ -209,13 +179,9 @@ def lmi_matrix(
         lipschitz_bound: L.
         slope: smallest and largest slope of the activation.
 
-    Returns:
-        Symmetric ``(n, n)``, n the sum of all layer sizes, input and output included.
-
-    Raises:
-        ShapeError: if the sizes do not follow each other.
-
-    Source: paper Lemma 2 (Pauli et al. 2021); deviation: the selection is [0 I 0], the paper prints [0 I].
+    Returns symmetric ``(n, n)``, n the sum of all layer sizes, input and output included. Raises ShapeError if the
+    sizes do not follow each other. Source: paper Lemma 2 (Pauli et al. 2021); deviation: the selection is [0 I 0], the
+    paper prints [0 I].
 
     Example:
         >>> lmi_matrix([torch.ones(1, 1), torch.ones(1, 1)], [torch.ones(1)], 2.0).tolist()
@@ -253,14 +219,8 @@ def lmi_loss(matrix: Tensor) -> Tensor:
     Args:
         matrix: symmetric ``(n, n)``.
 
-    Returns:
-        Scalar.
-
-    Raises:
-        NotPositiveDefiniteError: if M is not positive definite; the printed loss would go on with a meaningless
-            gradient.
-
-    Source: paper eq. (9); deviation: the cone is checked, the sign of the loss decides nothing.
+    Returns a scalar. Raises NotPositiveDefiniteError if M is not positive definite; the printed loss would go on with a
+    meaningless gradient. Source: paper eq. (9); deviation: the cone is checked, the sign of the loss decides nothing.
 
     Example:
         >>> round(float(lmi_loss(torch.diag(torch.tensor([2.0, 0.5])))), 6) == 0.0
@@ -290,11 +250,7 @@ class SafetyMargins(NamedTuple):
 
 
 def safety_margin(
-    lipschitz_bound: float,
-    covering_radius: float,
-    *,
-    mode: str = "sound",
-    closed_loop_lipschitz: float | None = None,
+    lipschitz_bound: float, covering_radius: float, *, mode: str = "sound", closed_loop_lipschitz: float | None = None
 ) -> SafetyMargins:
     r"""Margins that carry the conditions from samples to everything within the covering radius.
 
@@ -307,13 +263,9 @@ def safety_margin(
         mode: "paper" or "sound".
         closed_loop_lipschitz: :math:`L_{cl}`, Lipschitz constant of z -> d(z, pi(z)) (mode "sound").
 
-    Returns:
-        The three margins, units of the barrier.
-
-    Raises:
-        ConfigError: if the mode is unknown, or the constant of the closed loop is missing in mode "sound".
-
-    Source: paper Theorem 1; deviation: the third condition has its own constant in mode "sound".
+    Returns the three margins, units of the barrier. Raises ConfigError if the mode is unknown, or the constant of the
+    closed loop is missing in mode "sound". Source: paper Theorem 1; deviation: the third condition has its own constant
+    in mode "sound".
 
     Example:
         >>> safety_margin(2.0, 0.1, closed_loop_lipschitz=3.0)
@@ -335,10 +287,8 @@ def dynamics_margin(lipschitz_bound: float, dynamics_error: float) -> float:
         lipschitz_bound: :math:`L_B`.
         dynamics_error: :math:`\delta`, latent units.
 
-    Returns:
-        The margin, units of the barrier.
-
-    Source: paper Theorem 2; the same in both modes, what differs is the data on which the error is measured.
+    Returns the margin, units of the barrier. Source: paper Theorem 2; the same in both modes, what differs is the data
+    on which the error is measured.
 
     Example:
         >>> dynamics_margin(2.0, 0.25)
@@ -358,13 +308,8 @@ def covering_radius(points: Tensor, samples: Tensor, *, chunk: int = 4096, quant
         chunk: points at a time.
         quantile: 1 for the maximum, below for a quantile.
 
-    Returns:
-        The radius, latent units.
-
-    Raises:
-        EmptyRegionError: if there are no points or no samples.
-
-    Source: paper Theorem 1.
+    Returns the radius, latent units. Raises EmptyRegionError if there are no points or no samples. Source: paper
+    Theorem 1.
 
     Example:
         >>> covering_radius(torch.tensor([[0.0], [1.0]]), torch.tensor([[0.25]]))

@@ -42,12 +42,7 @@ def spawn(seed: int, purpose: str, index: int = 0) -> int:
         purpose: one of :data:`PURPOSES`.
         index: number among those of the purpose, below 2^24.
 
-    Returns:
-        Seed in [0, 2^32).
-
-    Raises:
-        ConfigError: if the purpose is not registered, or a number is out of range.
-
+    Returns seed in [0, 2^32). Raises ConfigError if the purpose is not registered, or a number is out of range.
     Source: none.
 
     Example:
@@ -75,10 +70,7 @@ def used_before(seed: int, history: Iterable[int]) -> bool:
         seed: the seed.
         history: seeds that were used.
 
-    Returns:
-        Whether one of them agrees in the 32 bits that ``torch.Generator`` keeps on the CPU.
-
-    Source: none.
+    Returns whether one of them agrees in the 32 bits that ``torch.Generator`` keeps on the CPU. Source: none.
 
     Example:
         >>> used_before(1, [2**32 + 1]), used_before(1, [2])

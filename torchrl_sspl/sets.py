@@ -44,14 +44,8 @@ class Region:
         Args:
             state: ``(*batch, dim)``, state units.
 
-        Returns:
-            bool ``(*batch,)``.
-
-        Raises:
-            ShapeError: if the last dimension is not ``dim``.
-            NonFiniteError: if a state is NaN.
-
-        Source: none.
+        Returns bool ``(*batch,)``. Raises ShapeError if the last dimension is not ``dim``; NonFiniteError if a state is
+        NaN. Source: none.
 
         Example:
             >>> Box([0.0], [1.0]).contains(torch.tensor([[0.0], [1.0], [1.1]]))
@@ -67,13 +61,7 @@ class Region:
             generator: random numbers, on ``device``.
             device: where the states go.
 
-        Returns:
-            ``(n, dim)``, float32, state units.
-
-        Raises:
-            EmptyRegionError: if no state is found.
-
-        Source: none.
+        Returns ``(n, dim)``, float32, state units. Raises EmptyRegionError if no state is found. Source: none.
 
         Example:
             >>> Box([0.0], [1.0]).sample(3, torch.Generator().manual_seed(0)).shape
@@ -96,9 +84,7 @@ class Box(Region):
         high: upper corner, larger in every component.
         period: period of every component, None or 0 where there is none.
 
-    Raises:
-        ConfigError: if the corners are not finite and in order, or a period is negative or of another length.
-
+    Raises ConfigError if the corners are not finite and in order, or a period is negative or of another length.
     Source: none.
 
     Example:
@@ -156,13 +142,8 @@ class Box(Region):
         Args:
             n: points per component, one number or one for each.
 
-        Returns:
-            ``(prod(n), dim)``, float32, last component fastest.
-
-        Raises:
-            ConfigError: if the number of sizes is not ``dim``, or one is below 1.
-
-        Source: none.
+        Returns ``(prod(n), dim)``, float32, last component fastest. Raises ConfigError if the number of sizes is not
+        ``dim``, or one is below 1. Source: none.
 
         Example:
             >>> Box([0.0, 0.0], [1.0, 2.0]).grid(2).tolist()
@@ -182,10 +163,7 @@ class Difference(Region):
         a: the set A.
         b: the set B, of the same dimension.
 
-    Raises:
-        ShapeError: if the dimensions differ.
-
-    Source: paper Section V (unsafe: the space without a box).
+    Raises ShapeError if the dimensions differ. Source: paper Section V (unsafe: the space without a box).
 
     Example:
         >>> ring = Difference(Box([-2.0], [2.0]), Box([-1.0], [1.0]))
@@ -208,8 +186,7 @@ class Difference(Region):
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
         """Samples of A without those in B; arguments as for :meth:`Region.sample`.
 
-        Raises:
-            EmptyRegionError: if (almost) every sample of A is in B.
+        Raises EmptyRegionError if (almost) every sample of A is in B.
 
         Example:
             >>> ring = Box([-2.0], [2.0]) - Box([-1.0], [1.0])
@@ -236,11 +213,7 @@ class Union(Region):
     Args:
         *parts: the sets, of the same dimension.
 
-    Raises:
-        ConfigError: if there are none.
-        ShapeError: if the dimensions differ.
-
-    Source: none.
+    Raises ConfigError if there are none; ShapeError if the dimensions differ. Source: none.
 
     Example:
         >>> (Box([0.0], [1.0]) | Box([2.0], [3.0])).contains(torch.tensor([[0.5], [1.5], [2.5]]))
@@ -280,10 +253,7 @@ class Mixture(Union):
         parts (sequence of Region): regions of the same dimension.
         shares (sequence of float): how often each is drawn from, not negative, not all zero.
 
-    Raises:
-        ConfigError: the shares do not fit the parts.
-
-    Source: none.
+    Raises ConfigError if the shares do not fit the parts. Source: none.
 
     Example:
         >>> left, right = Box([-1.0], [0.0]), Box([1.0], [2.0])
@@ -313,14 +283,8 @@ def label(state: Tensor, safe: Region, unsafe: Region) -> Tensor:
         safe: the set S.
         unsafe: the set U.
 
-    Returns:
-        int64 ``(*batch, 1)``.
-
-    Raises:
-        ShapeError: if the last dimension is not that of the sets.
-        NonFiniteError: if a state is NaN.
-
-    Source: paper Section III (the labelled data).
+    Returns int64 ``(*batch, 1)``. Raises ShapeError if the last dimension is not that of the sets; NonFiniteError if a
+    state is NaN. Source: paper Section III (the labelled data).
 
     Example:
         >>> label(torch.tensor([[0.5], [1.5], [2.5]]), Box([0.0], [1.0]), Box([2.0], [3.0])).flatten()
@@ -338,11 +302,7 @@ def check_disjoint(safe: Region, unsafe: Region, n: int = 4096) -> None:
         unsafe: the set U.
         n: samples of each set.
 
-    Raises:
-        OverlapError: if the sets share a sample.
-        EmptyRegionError: if a set has (almost) no volume.
-
-    Source: none.
+    Raises OverlapError if the sets share a sample; EmptyRegionError if a set has (almost) no volume. Source: none.
 
     Example:
         >>> check_disjoint(Box([0.0], [1.0]), Box([2.0], [3.0]))

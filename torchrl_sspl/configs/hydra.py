@@ -34,10 +34,7 @@ class HydraConfig(Config):
 def register() -> None:
     """Put the configuration into Hydra's ConfigStore: ``sspl``, with the groups env, preset, loss and logger.
 
-    Raises:
-        MissingDependencyError: if Hydra is not installed.
-
-    Source: none.
+    Raises MissingDependencyError if Hydra is not installed. Source: none.
     """
     try:
         from hydra.core.config_store import ConfigStore
@@ -64,12 +61,7 @@ def to_config(node: Any) -> Config:
     Args:
         node: the composed configuration.
 
-    Returns:
-        The configuration, checked.
-
-    Raises:
-        ConfigError: if a key is unknown, or values do not go together.
-
+    Returns the configuration, checked. Raises ConfigError if a key is unknown, or values do not go together.
     Source: none.
     """
     try:

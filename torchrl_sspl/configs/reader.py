@@ -47,14 +47,9 @@ def compose(overrides: Sequence[str] = (), **defaults: Any) -> Config:
             for ``loss.preset=paper``; ``null`` and ``none`` are the same.
         **defaults: values of the caller (nested keys with a dot need ``**{"a.b": v}``).
 
-    Returns:
-        The configuration, checked. Without ``env=`` its ``env`` is empty: for a system that is given in code.
-
-    Raises:
-        ConfigError: if an override is not ``key=value``, a key is unknown (the nearest valid ones are named), or a value
-            has the wrong type or does not go with the others.
-
-    Source: none.
+    Returns the configuration, checked. Without ``env=`` its ``env`` is empty: for a system that is given in code.
+    Raises ConfigError if an override is not ``key=value``, a key is unknown (the nearest valid ones are named), or a
+    value has the wrong type or does not go with the others. Source: none.
 
     Example:
         >>> config = compose(["env=pendulum", "seed=3", "synthesis.rounds=1"], out_dir="runs/a")
@@ -80,13 +75,7 @@ def parse(overrides: Sequence[str]) -> dict[str, str]:
     Args:
         overrides: the strings.
 
-    Returns:
-        Text by key.
-
-    Raises:
-        ConfigError: if ``overrides`` is not a list of such strings.
-
-    Source: none.
+    Returns text by key. Raises ConfigError if ``overrides`` is not a list of such strings. Source: none.
 
     Example:
         >>> parse(["seed=3", "logger=none"])
@@ -114,12 +103,7 @@ def from_dict(values: Mapping[str, Any]) -> Config:
     Args:
         values: what differs from the dataclasses' defaults, or everything.
 
-    Returns:
-        The configuration, checked.
-
-    Raises:
-        ConfigError: if a key is unknown or a value has the wrong type.
-
+    Returns the configuration, checked. Raises ConfigError if a key is unknown or a value has the wrong type.
     Source: none.
 
     Example:
@@ -278,10 +262,7 @@ def save(config: Config, path: str | Path) -> Path:
         config: the configuration.
         path: the file; it is replaced in one step.
 
-    Returns:
-        The file.
-
-    Source: none.
+    Returns the file. Source: none.
     """
     path = Path(path)
     body = config.to_dict()
@@ -298,13 +279,8 @@ def load(path: str | Path) -> Config:
     Args:
         path: the file.
 
-    Returns:
-        The configuration, checked.
-
-    Raises:
-        ConfigError: if the file cannot be read, a key is unknown or a value has the wrong type.
-
-    Source: none.
+    Returns the configuration, checked. Raises ConfigError if the file cannot be read, a key is unknown or a value has
+    the wrong type. Source: none.
 
     Example:
         >>> import tempfile
@@ -322,13 +298,7 @@ def change(config: Config, overrides: Sequence[str]) -> Config:
         config: the configuration, which stays as it is.
         overrides: ``key=value`` strings.
 
-    Returns:
-        The changed one, checked.
-
-    Raises:
-        ConfigError: as for :func:`compose`.
-
-    Source: none.
+    Returns the changed one, checked. Raises ConfigError as for :func:`compose`. Source: none.
 
     Example:
         >>> change(compose(["seed=3"]), ["evaluation.episodes=5"]).evaluation.episodes
@@ -343,10 +313,7 @@ def valid_keys(config: Config) -> list[str]:
     Args:
         config: the configuration.
 
-    Returns:
-        Keys such as ``"network.latent_dim"``.
-
-    Source: none.
+    Returns keys such as ``"network.latent_dim"``. Source: none.
 
     Example:
         >>> "env.image_size" in valid_keys(compose(["env=pendulum"]))
@@ -406,10 +373,7 @@ def attribute_texts(kind: Any) -> dict[str, str]:
     Args:
         kind: documented class or function.
 
-    Returns:
-        Text by name.
-
-    Source: none.
+    Returns text by name. Source: none.
 
     Example:
         >>> attribute_texts(Config)["out_dir"]
@@ -435,13 +399,7 @@ def resolve(path: str) -> Any:
     Args:
         path: ``"package.module:name"`` or ``"package.module.name"``; the working directory is searched too.
 
-    Returns:
-        The object.
-
-    Raises:
-        ConfigError: if there is no such module, or no such name in it.
-
-    Source: none.
+    Returns the object. Raises ConfigError if there is no such module, or no such name in it. Source: none.
 
     Example:
         >>> resolve("torchrl_sspl.sets:SAFE")
@@ -518,10 +476,7 @@ class EnvFactory:
     Args:
         env: section ``env`` of a configuration: an import path ``_target_``, and its arguments.
 
-    Raises:
-        ConfigError: if the target cannot be imported, or does not take these arguments.
-
-    Source: none.
+    Raises ConfigError if the target cannot be imported, or does not take these arguments. Source: none.
 
     Example:
         >>> EnvFactory(compose(["env=pendulum", "env.image_size=32"]).env)(batch_size=[2], seed=0).reset()["pixels"].shape
@@ -571,13 +526,7 @@ def gymnasium_env(
         reset_options: "package.module:function" of a random generator that gives the options of a reset.
         seed: of the resets.
 
-    Returns:
-        The environment.
-
-    Raises:
-        ConfigError: if a predicate is missing or a path cannot be imported.
-
-    Source: none.
+    Returns the environment. Raises ConfigError if a predicate is missing or a path cannot be imported. Source: none.
     """
     from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 

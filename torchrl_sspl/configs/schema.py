@@ -385,8 +385,7 @@ class Config:
     def check(self) -> Config:
         """The configuration itself, after a look at values that do not go together.
 
-        Raises:
-            ConfigError: if one is not valid; the message names it.
+        Raises ConfigError if one is not valid; the message names it.
         """
         for key, choices in _CHOICES.items():
             section, name = key.split(".")

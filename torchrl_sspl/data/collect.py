@@ -84,9 +84,7 @@ class ExploringPolicy(TensorDictModuleBase):
     low: Tensor
     high: Tensor
 
-    def __init__(
-        self, policy: nn.Module, low: Tensor, high: Tensor, exploration: float, random_share: float
-    ) -> None:
+    def __init__(self, policy: nn.Module, low: Tensor, high: Tensor, exploration: float, random_share: float) -> None:
         super().__init__()
         self.in_keys, self.out_keys = ["pixels"], ["action"]
         self.policy, self.exploration, self.random_share = policy, exploration, random_share
@@ -135,13 +133,8 @@ def collect_random(
         **collector: arguments of ``torchrl.collectors.Collector``, such as ``backend``, ``num_collectors``,
             ``frames_per_batch``. Default ``backend="direct"``.
 
-    Returns:
-        TransitionStore: the store with n more transitions.
-
-    Raises:
-        ConfigError: ``n`` or ``steps`` is not positive, or ``region`` is given with a function.
-
-    Source: paper, Section IV-D (warm start on uniform random actions). Deviation: none.
+    Returns the store with n more transitions. Raises ConfigError if ``n`` or ``steps`` is not positive, or ``region``
+    is given with a function. Source: paper, Section IV-D (warm start on uniform random actions). Deviation: none.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
@@ -152,15 +145,7 @@ def collect_random(
     probe = env if isinstance(env, EnvBase) else env()
     policy = RandomActions(probe, None if seed is None else seed + 1)
     return collect_rollouts(
-        env,
-        policy,
-        n,
-        seed=seed,
-        steps=steps,
-        region=region,
-        store=store,
-        keep_state=keep_state,
-        **collector,
+        env, policy, n, seed=seed, steps=steps, region=region, store=store, keep_state=keep_state, **collector
     )
 
 
@@ -182,13 +167,8 @@ def collect_rollouts(
         policy: tensordict module or callable that writes ``"action"``; let it write nothing else
             (``selected_out_keys=["action"]``), what it writes is carried along.
 
-    Returns:
-        TransitionStore: the store with n more transitions.
-
-    Raises:
-        ConfigError: ``n`` or ``steps`` is not positive, or ``region`` is given with a function.
-
-    Source: Algorithm 1 of the paper (rollouts of the policy join D). Deviation: none.
+    Returns the store with n more transitions. Raises ConfigError if ``n`` or ``steps`` is not positive, or ``region``
+    is given with a function. Source: Algorithm 1 of the paper (rollouts of the policy join D). Deviation: none.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
@@ -269,14 +249,8 @@ def make_collector(
         ray_address: address of a running cluster; ``""`` starts Ray on this machine.
         seed: seed of the environments; workers get different ones.
 
-    Returns:
-        The collector.
-
-    Raises:
-        ConfigError: if the backend is unknown, or the numbers do not go together.
-        MissingDependencyError: if Ray is asked for and not installed.
-
-    Source: none.
+    Returns the collector. Raises ConfigError if the backend is unknown, or the numbers do not go together;
+    MissingDependencyError if Ray is asked for and not installed. Source: none.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv

@@ -24,10 +24,7 @@ def encode_transitions(
         store: transitions.
         index: ``(n,)`` which of them; by default all.
 
-    Returns:
-        ``"latent"``, ``"next_latent"``, ``"action"`` and ``"region"``, on the CPU.
-
-    Source: none.
+    Returns ``"latent"``, ``"next_latent"``, ``"action"`` and ``"region"``, on the CPU. Source: none.
     """
     parts = []
     for rows in (torch.arange(len(store)) if index is None else index).split(_CHUNK):

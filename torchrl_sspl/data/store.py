@@ -47,10 +47,8 @@ class TransitionStore(Storage):
         pixel_views (bool): hand out the observations beside the frames. Default False.
         keep_state (bool): keep the true states, for evaluation. Default False.
 
-    Raises:
-        ConfigError: ``capacity`` is not a positive integer.
-
-    Source: the data sets D, S, U of the paper (Section IV): S and U are the labelled part of D, not copies.
+    Raises ConfigError if ``capacity`` is not a positive integer. Source: the data sets D, S, U of the paper (Section
+    IV): S and U are the labelled part of D, not copies.
 
     Example:
         >>> import torch
@@ -103,8 +101,7 @@ class TransitionStore(Storage):
     def indices(self, region: int | None = None) -> Tensor:
         """Positions of the transitions that start in a region (a code of ``sets``), or of all.
 
-        Raises:
-            EmptyRegionError: there is none.
+        Raises EmptyRegionError if there is none.
         """
         if region not in self._by_region:
             found = torch.arange(self._len) if region is None else (self.region == region).nonzero().squeeze(1)
@@ -218,17 +215,11 @@ class TransitionStore(Storage):
         return out[0] if single else out
 
     def sample(
-        self,
-        n: int,
-        generator: torch.Generator | None = None,
-        *,
-        safe: float = 0.0,
-        unsafe: float = 0.0,
+        self, n: int, generator: torch.Generator | None = None, *, safe: float = 0.0, unsafe: float = 0.0
     ) -> TensorDict:
         """Draw n transitions with replacement: shares ``safe`` and ``unsafe`` from S and U, the rest from D.
 
-        Raises:
-            EmptyRegionError: a set from which a positive share is wanted is empty.
+        Raises EmptyRegionError if a set from which a positive share is wanted is empty.
         """
         return self.get(stratified_indices(self, n, safe, unsafe, generator))
 
@@ -301,8 +292,7 @@ class TransitionStore(Storage):
     def loads(self, path: str | os.PathLike[str]) -> None:
         """Read what ``dumps`` wrote.
 
-        Raises:
-            CheckpointError: there is no such file, or it cannot be read, or it does not fit the capacity.
+        Raises CheckpointError if there is no such file, or it cannot be read, or it does not fit the capacity.
         """
         state, meta = _read(Path(path))
         self.load_state_dict({**state, "_meta": meta})
@@ -366,17 +356,12 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
 
 
 def stratified_indices(
-    store: TransitionStore,
-    n: int,
-    safe: float = 0.0,
-    unsafe: float = 0.0,
-    generator: torch.Generator | None = None,
+    store: TransitionStore, n: int, safe: float = 0.0, unsafe: float = 0.0, generator: torch.Generator | None = None
 ) -> Tensor:
     """Positions of n transitions: ``round(n safe)`` from S, ``round(n unsafe)`` from U, the rest from D.
 
-    Raises:
-        ConfigError: a share is negative, or they add up to more than 1.
-        EmptyRegionError: a set from which a positive share is wanted is empty.
+    Raises ConfigError if a share is negative, or they add up to more than 1; EmptyRegionError if a set from which a
+    positive share is wanted is empty.
     """
     if safe < 0 or unsafe < 0 or safe + unsafe > 1:
         raise ConfigError(f"shares: expected safe, unsafe >= 0 with a sum <= 1, received {safe}, {unsafe}.")
@@ -399,10 +384,7 @@ class RegionSampler(Sampler):
     Args:
         safe, unsafe (float): shares of S and U. Default one eighth each.
 
-    Raises:
-        ConfigError: a share is negative, they add up to more than 1, or the storage is not a
-            ``TransitionStore``.
-
+    Raises ConfigError if a share is negative, they add up to more than 1, or the storage is not a ``TransitionStore``.
     Source: Algorithm 1 of the paper (samples of S, U and D). Deviation: none.
 
     Example:

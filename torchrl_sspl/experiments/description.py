@@ -20,11 +20,8 @@ def describe(value: Any) -> Any:
     Args:
         value: such as ``partial(GymnasiumPixels, make, safe=..., unsafe=..., image_size=64)``.
 
-    Returns:
-        What JSON can write. Two functions with the same digest compute the same, as far as their code, their defaults, what
-        they close over and what they read from their own module go.
-
-    Source: none.
+    Returns what JSON can write. Two functions with the same digest compute the same, as far as their code, their
+    defaults, what they close over and what they read from their own module go. Source: none.
 
     Example:
         >>> describe(partial(dict, safe=lambda state, info: state[0] < 1, image_size=64))["image_size"]
@@ -86,10 +83,7 @@ def differences(one: Any, other: Any, path: str = "") -> list[str]:
         other: what is.
         path: of both, inside something larger.
 
-    Returns:
-        A line for every difference.
-
-    Source: none.
+    Returns a line for every difference. Source: none.
 
     Example:
         >>> differences({"a": 1, "b": {"c": 2}}, {"a": 1, "b": {"c": 3}})

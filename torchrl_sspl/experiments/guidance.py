@@ -20,10 +20,7 @@ def advice(certificate: Certificate | None, config: Config) -> list[str]:
         certificate: of the run; None where it has none.
         config: of the run.
 
-    Returns:
-        Sentences without a full stop; none where both layers hold.
-
-    Source: none.
+    Returns sentences without a full stop; none where both layers hold. Source: none.
     """
     if certificate is None:
         return []
@@ -51,11 +48,7 @@ def advice(certificate: Certificate | None, config: Config) -> list[str]:
 
 
 def check_factory(make_env: Any) -> None:
-    """Refuse what cannot make environments.
-
-    Raises:
-        ConfigError: if it is an environment, or cannot be called.
-    """
+    """Refuse what cannot make environments. Raises ConfigError if it is an environment, or cannot be called."""
     if isinstance(make_env, EnvBase) or not callable(make_env):
         raise ConfigError(
             "make_env: expected a function (batch_size=[n], seed=...) -> environment, such as partial(GymnasiumPixels, make, "
@@ -67,8 +60,7 @@ def check_factory(make_env: Any) -> None:
 def check_encoder(encoder: nn.Module, pixels: Tensor, latent_dim: int) -> None:
     """One look at what an encoder makes of an observation, before anything is trained.
 
-    Raises:
-        ConfigError: if it cannot take uint8 pixels, or its latents have another shape or leave [-1, 1].
+    Raises ConfigError if it cannot take uint8 pixels, or its latents have another shape or leave [-1, 1].
     """
     mode, shape = encoder.training, tuple(pixels.shape)
     encoder.eval()

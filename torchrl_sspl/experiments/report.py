@@ -48,13 +48,9 @@ def write_run_report(outcome: Outcome, env: SafetyEnv | None, *, title: str | No
         env: the system, as it was trained on; None where it is known by being run only.
         title: title of the page; by default the system's.
 
-    Returns:
-        Matplotlib figures by title; they are in ``figures/`` of the run too.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Section V (figures); deviation: the true kernel, measurements and verdicts are added.
+    Returns matplotlib figures by title; they are in ``figures/`` of the run too. Raises MissingDependencyError if
+    matplotlib is not installed. Source: paper Section V (figures); deviation: the true kernel, measurements and
+    verdicts are added.
     """
     folder = Path(outcome.directory) / "figures"
     folder.mkdir(parents=True, exist_ok=True)
@@ -99,13 +95,8 @@ def draw_figures(outcome: Outcome, env: SafetyEnv | None) -> dict[str, Any]:
         outcome: of the run.
         env: the system, as it was trained on; None where it is known by being run only.
 
-    Returns:
-        Matplotlib figures by title.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Section V; deviation: see the figures.
+    Returns matplotlib figures by title. Raises MissingDependencyError if matplotlib is not installed. Source: paper
+    Section V; deviation: see the figures.
     """
     arrays, barrier = outcome.evaluations["own"].arrays, getattr(outcome.agent, "barrier", None)
     figures = _of_episodes(arrays, barrier) if env is None else _of_states(arrays, barrier, env)

@@ -62,10 +62,8 @@ def agent_phases(config: Config, *, known: bool) -> list[Phase]:
         config: of the run.
         known: whether the environment knows its sets.
 
-    Returns:
-        The phases in order; with ``synthesis.enabled=false``, or the losses as printed, the placing of the level alone.
-
-    Source: paper Algorithm 1; deviation: two time scales.
+    Returns the phases in order; with ``synthesis.enabled=false``, or the losses as printed, the placing of the level
+    alone. Source: paper Algorithm 1; deviation: two time scales.
     """
     s, e = config.synthesis, config.evaluation
     level: dict[str, Any] = {"episodes": e.episodes, "horizon": e.horizon, "envs": e.envs, "progress": config.trainer.progress}
@@ -88,10 +86,8 @@ class Experiment:
             what ``config.network`` describes.
         title: title of the report; by default the system's.
 
-    Raises:
-        ConfigError: if values of the configuration do not go together, or the environment lacks labels.
-
-    Source: paper, Algorithm 1, on TorchRL's trainer.
+    Raises ConfigError if values of the configuration do not go together, or the environment lacks labels. Source:
+    paper, Algorithm 1, on TorchRL's trainer.
     """
 
     def __init__(
@@ -278,14 +274,9 @@ class Experiment:
         Args:
             resume: continue from a checkpoint in the directory, if there is one.
 
-        Returns:
-            The agent; it is in ``agent/`` too.
-
-        Raises:
-            CheckpointError: the directory holds a run of another system, other networks or other settings.
-            EmptyRegionError: S or U never occurs in the data.
-
-        Source: paper, Algorithm 1.
+        Returns the agent; it is in ``agent/`` too. Raises CheckpointError if the directory holds a run of another
+        system, other networks or other settings; EmptyRegionError if S or U never occurs in the data. Source: paper,
+        Algorithm 1.
         """
         rotation = self.trainer.checkpoint_rotation
         latest = rotation.latest() if rotation is not None else None
@@ -345,10 +336,7 @@ class Experiment:
         Args:
             agent: frozen agent.
 
-        Returns:
-            Evaluations by name: ``"own"``, and one for every further renderer of the system.
-
-        Source: none.
+        Returns evaluations by name: ``"own"``, and one for every further renderer of the system. Source: none.
         """
         e, progress = self.config.evaluation, self.config.trainer.progress
         if not self.known:
@@ -376,10 +364,7 @@ class Experiment:
         Args:
             agent: frozen agent.
 
-        Returns:
-            The certificate.
-
-        Source: none.
+        Returns the certificate. Source: none.
         """
         e, progress = self.config.evaluation, self.config.trainer.progress
         budget, name = Budget(seconds=e.certificate_seconds), self.directory.name
@@ -402,10 +387,7 @@ class Experiment:
         Args:
             resume: continue from a checkpoint in the directory, if there is one.
 
-        Returns:
-            The outcome; ``metrics.json``, ``report.html`` and ``agent/`` are on disk.
-
-        Source: none.
+        Returns the outcome; ``metrics.json``, ``report.html`` and ``agent/`` are on disk. Source: none.
         """
         trained = not self.config.agent
         agent = (self.train(resume=resume) if trained else load(self.config.agent)).to(self.device)
@@ -470,10 +452,7 @@ def finish(experiment: Experiment, outcome: Outcome) -> Outcome:
         experiment: the run.
         outcome: what it has produced.
 
-    Returns:
-        The outcome with its report.
-
-    Source: none.
+    Returns the outcome with its report. Source: none.
     """
     write_metrics(outcome)
     frames = experiment.trainer.collected_frames
@@ -513,12 +492,7 @@ def run_experiment(
         title: title of the report.
         **defaults: values in place of the defaults (nested keys with a dot need ``**{"a.b": v}``).
 
-    Returns:
-        The outcome: agent, evaluation, certificate, report.
-
-    Raises:
-        ConfigError: if a key or a value is not valid.
-
+    Returns the outcome: agent, evaluation, certificate, report. Raises ConfigError if a key or a value is not valid.
     Source: paper, Algorithm 1.
     """
     given = sorted({k.partition("=")[0] for k in (*overrides, *defaults) if str(k).partition("=")[0].split(".")[0] == "env"})

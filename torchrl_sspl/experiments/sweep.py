@@ -103,13 +103,8 @@ def expand(overrides: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
     Args:
         overrides: ``key=value`` strings; commas within brackets or quotes do not separate.
 
-    Returns:
-        Name and values by key of each run.
-
-    Raises:
-        ConfigError: if a value is empty or given twice, or ``out_dir`` has several.
-
-    Source: none.
+    Returns the name and the values by key of each run. Raises ConfigError if a value is empty or given twice, or ``out_dir``
+    has several. Source: none.
 
     Example:
         >>> [name for name, _ in expand(["seed=0,1", "network.policy_hidden=[8,8]", "optim.lr=.1"])]
@@ -148,13 +143,7 @@ def plan(overrides: Sequence[str]) -> tuple[Path, list[Task]]:
     Args:
         overrides: see :func:`expand`.
 
-    Returns:
-        Directory, and the runs.
-
-    Raises:
-        ConfigError: if one of the configurations is not valid.
-
-    Source: none.
+    Returns the directory and the runs. Raises ConfigError if one of the configurations is not valid. Source: none.
     """
     tasks: list[Task] = []
     folders = set()
@@ -186,14 +175,8 @@ def sweep(
         jobs: runs at a time; default: as many as there are cores, on Ray as many as it has room for.
         command: what is called with the words of each run.
 
-    Returns:
-        What was done; ``sweep.json`` and ``comparison.html`` are on disk.
-
-    Raises:
-        ConfigError: if a configuration is not valid; before anything is started.
-        MissingDependencyError: if Ray is asked for and not installed.
-
-    Source: none.
+    Returns what was done; ``sweep.json`` and ``comparison.html`` are on disk. Raises ConfigError if a configuration is
+    not valid, before anything is started, and MissingDependencyError if Ray is asked for and not installed. Source: none.
     """
     if launcher not in LAUNCHERS:
         raise ConfigError(f"expected --launcher to be one of {', '.join(LAUNCHERS)}, received '{launcher}'")

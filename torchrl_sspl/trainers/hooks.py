@@ -41,10 +41,7 @@ class MarginHook(TrainerHookBase):
         maximum: largest margin that is set, in units of the barrier; early estimates can be larger
             than anything that a barrier can satisfy.
 
-    Raises:
-        ConfigError: if an argument is not valid.
-
-    Source: paper, Algorithm 1, with eq. (6) and (11).
+    Raises ConfigError if an argument is not valid. Source: paper, Algorithm 1, with eq. (6) and (11).
 
     Example:
         >>> from torchrl_sspl.data import TransitionStore
@@ -209,9 +206,7 @@ class FitEncoderHook(TrainerHookBase):
 
 
 class ClockHook(TrainerHookBase):
-    """Counts the seconds of a training over all of its interruptions.
-
-    Source: none.
+    """Counts the seconds of a training over all of its interruptions. Source: none.
 
     Example:
         >>> ClockHook().seconds < 1.0
@@ -251,10 +246,7 @@ class LogHook(TrainerHookBase):
     Args:
         path: the file; ``None``: nothing is written.
 
-    Raises:
-        ConfigError: when called with a loss that is NaN or infinite.
-
-    Source: none.
+    Raises ConfigError when called with a loss that is NaN or infinite. Source: none.
 
     Example:
         >>> LogHook(None)(7, {"loss_safe": torch.zeros(())})
@@ -305,10 +297,7 @@ class RestartHook(TrainerHookBase):
         after: optimiser steps since the last start before which it never happens.
         most: fresh starts at most.
 
-    Raises:
-        ConfigError: if a number is not positive.
-
-    Source: none; the paper does not start again.
+    Raises ConfigError if a number is not positive. Source: none; the paper does not start again.
 
     Example:
         >>> RestartHook(None, lambda attempt: None, after=1200, most=2).state_dict()
@@ -364,10 +353,8 @@ class EveryHook(TrainerHookBase):
             training: the certificate holds, the figures are reached.
         every: collected batches between two calls.
 
-    Raises:
-        ConfigError: if ``every`` is not positive.
-
-    Source: paper, Algorithm 1 (stop rule); deviation: the printed rule, a total loss of zero, is never met.
+    Raises ConfigError if ``every`` is not positive. Source: paper, Algorithm 1 (stop rule); deviation: the printed
+    rule, a total loss of zero, is never met.
 
     Example:
         >>> EveryHook(None, lambda trainer: {}, every=5).state_dict()

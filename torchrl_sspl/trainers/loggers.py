@@ -96,14 +96,8 @@ def make_logger(
         directory: folder in which the logger writes.
         project: project of wandb.
 
-    Returns:
-        The logger, or ``None`` for ``"none"``.
-
-    Raises:
-        ConfigError: if the kind is unknown.
-        MissingDependencyError: if its package is not installed.
-
-    Source: none.
+    Returns the logger, or ``None`` for ``"none"``. Raises ConfigError if the kind is unknown; MissingDependencyError if
+    its package is not installed. Source: none.
 
     Example:
         >>> make_logger("none") is None
@@ -137,10 +131,7 @@ def make_logger(
 def wandb_offline() -> bool:
     """Whether a wandb run has to stay on disk: no key, or no way to its server.
 
-    Returns:
-        True if so; ``WANDB_MODE`` decides where it is set.
-
-    Source: none.
+    Returns true if so; ``WANDB_MODE`` decides where it is set. Source: none.
     """
     mode = os.environ.get("WANDB_MODE", "").lower()
     if mode:
@@ -179,10 +170,7 @@ def log_scalars(logger: Any, values: Mapping[str, Any], step: int) -> None:
         values: names, all of them in :data:`METRICS`, and numbers.
         step: collected frames, or optimiser steps.
 
-    Raises:
-        ConfigError: if a name is not in :data:`METRICS`.
-
-    Source: none.
+    Raises ConfigError if a name is not in :data:`METRICS`. Source: none.
 
     Example:
         >>> log_scalars(None, {"grad_norm": 1.0}, step=0)
@@ -208,10 +196,7 @@ def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
         figure: matplotlib figure.
         step: collected frames.
 
-    Returns:
-        The file that was written, if any.
-
-    Source: none.
+    Returns the file that was written, if any. Source: none.
 
     Example:
         >>> log_figure(None, "latent", None, 0) is None
@@ -246,14 +231,8 @@ def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 1
         step: collected frames.
         fps: frames per second.
 
-    Returns:
-        The file that was written, if any.
-
-    Raises:
-        ShapeError: if there is no frame, or the shape does not fit.
-        DTypeError: if the frames are not uint8.
-
-    Source: none.
+    Returns the file that was written, if any. Raises ShapeError if there is no frame, or the shape does not fit;
+    DTypeError if the frames are not uint8. Source: none.
 
     Example:
         >>> import torch
@@ -293,10 +272,7 @@ def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 1
 def encode_gif(frames: Tensor, fps: int = 10) -> bytes:
     """Frames ``(T, 3, H, W)`` uint8 as the bytes of an endless gif.
 
-    Raises:
-        MissingDependencyError: if Pillow is not installed.
-
-    Source: none.
+    Raises MissingDependencyError if Pillow is not installed. Source: none.
     """
     _need("PIL", "viz")
     from PIL import Image

@@ -65,8 +65,7 @@ class InnerLoop:
             networks: what is trained, with the peak learning rate of each.
             loss: draws a batch, returns terms (a TensorDict or a dictionary); those named ``loss*`` are added up.
 
-        Raises:
-            ConfigError: a loss is not finite.
+        Raises ConfigError if a loss is not finite.
         """
         adam = torch.optim.Adam([{"params": list(m.parameters()), "lr": lr} for m, lr in networks.items()])
         # Of ten steps the rise would be one minus one: OneCycleLR divides by it.

@@ -40,9 +40,7 @@ class CheckRound(Phase):
 
     The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations of U
     for every episode, 32,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim, in the first
-    steps, so many short episodes say more than few long ones.
-
-    Source: none; the paper stops at a total loss of zero.
+    steps, so many short episodes say more than few long ones. Source: none; the paper stops at a total loss of zero.
     """
 
     name = "check"

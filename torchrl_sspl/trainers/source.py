@@ -30,10 +30,7 @@ def starts_of(env: SafetyEnv, shares: Sequence[float]) -> Region:
         env: knows its sets.
         shares: four numbers.
 
-    Returns:
-        The mixture.
-
-    Source: paper Section IV (S, U and D are sampled apart).
+    Returns the mixture. Source: paper Section IV (S, U and D are sampled apart).
     """
     return Mixture([env.state_space, env.state_space - env.unsafe_set, env.safe_set, env.unsafe_set], shares)
 
@@ -122,8 +119,7 @@ class Source:
         Args:
             most: of more than that, those of S and U first, up to half, and others at random.
 
-        Returns:
-            The latents; ``None`` without a store.
+        Returns the latents; ``None`` without a store.
         """
         if self.store is None or not len(self.store):
             return None

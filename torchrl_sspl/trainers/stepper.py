@@ -50,11 +50,8 @@ class SSPLStepper(OptimizationStepper):
         during it) and, with ``lipschitz_loss``, ``lipschitz_share`` (of the last :math:`L_M` step that
         was kept). The keys do not vary.
 
-    Raises:
-        ConfigError: if only one of ``lipschitz_loss`` and ``lipschitz_optimizer`` is given, the number of steps is
-            negative, or the error is not positive.
-
-    Source: paper, Algorithm 1; deviation: the steps never leave the cone.
+    Raises ConfigError if only one of ``lipschitz_loss`` and ``lipschitz_optimizer`` is given, the number of steps is
+    negative, or the error is not positive. Source: paper, Algorithm 1; deviation: the steps never leave the cone.
 
     Example:
         >>> weight = nn.Parameter(torch.zeros(1))
@@ -106,8 +103,7 @@ class SSPLStepper(OptimizationStepper):
             trainer: the trainer that runs it; gives loss module and clipping.
             sub_batch: batch of transitions.
 
-        Returns:
-            Detached scalars.
+        Returns detached scalars.
         """
         blind = self.blind
         warm = blind or self.count < self.warm_start_steps or self.warm_start_steps < 0
@@ -132,9 +128,7 @@ class SSPLStepper(OptimizationStepper):
         return TensorDict(output, batch_size=[])
 
     def _clip(self, trainer: Trainer) -> Tensor:
-        parameters = [
-            p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None
-        ]
+        parameters = [p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
         limit = trainer.clip_norm
         if limit is not None and not trainer.clip_grad_norm:
             nn.utils.clip_grad_value_(parameters, limit)
@@ -186,8 +180,7 @@ def learnable(modules: Iterable[nn.Module]) -> list[nn.Parameter]:
     Args:
         modules: networks or losses, which may share parameters.
 
-    Returns:
-        The parameters in the order in which they are met.
+    Returns the parameters in the order in which they are met.
 
     Example:
         >>> layer = nn.Linear(2, 1)

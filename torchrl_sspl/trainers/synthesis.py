@@ -52,9 +52,8 @@ class Gather(Phase):
 
     Where the environment knows its sets, further rounds add transitions of the exploring policy that start in the set or
     near it, and of many that start in U those whose pictures the present barrier puts lowest: the rim of U is where a set
-    goes wrong first. Elsewhere they add episodes of the exploring policy from the environment's own resets.
-
-    Source: paper Algorithm 1 (rollouts join D); deviation: which of them are kept is decided by their pictures.
+    goes wrong first. Elsewhere they add episodes of the exploring policy from the environment's own resets. Source:
+    paper Algorithm 1 (rollouts join D); deviation: which of them are kept is decided by their pictures.
     """
 
     name = "gather"
@@ -305,10 +304,7 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
         check: ``round -> phase`` that ends every round, such as
             :class:`~torchrl_sspl.trainers.selection.CheckRound`; ``None``: nothing is checked.
 
-    Returns:
-        The phases in order; leave some out, or put your own between them.
-
-    Source: paper Algorithm 1.
+    Returns the phases in order; leave some out, or put your own between them. Source: paper Algorithm 1.
 
     Example:
         >>> [phase.name for phase in synthesis_phases(SynthesisConfig())]
@@ -329,13 +325,7 @@ def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
         action_scale: largest action per dimension, physical units.
         per_dimension: actions per dimension.
 
-    Returns:
-        ``(k, m)``.
-
-    Raises:
-        ConfigError: the action has too many dimensions.
-
-    Source: none.
+    Returns ``(k, m)``. Raises ConfigError if the action has too many dimensions. Source: none.
 
     Example:
         >>> action_grid([2.0], 3)[:, 0].tolist()

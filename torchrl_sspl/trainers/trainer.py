@@ -82,10 +82,8 @@ class SSPLTrainer(Trainer):
         **trainer_options: further arguments of ``torchrl.trainers.Trainer``, such as ``logger``,
             ``clip_norm``, ``log_interval``, ``seed``.
 
-    Raises:
-        ConfigError: if the loss is no ``SSPLLoss``, or arguments do not go together.
-
-    Source: paper, Algorithm 1; deviations: see the loss and the hooks.
+    Raises ConfigError if the loss is no ``SSPLLoss``, or arguments do not go together. Source: paper, Algorithm 1;
+    deviations: see the loss and the hooks.
 
     Example:
         >>> from torchrl.collectors import Collector
@@ -178,9 +176,7 @@ class SSPLTrainer(Trainer):
             phases.register(self)
 
     @staticmethod
-    def _checked(
-        loss: SSPLLoss, updater: TargetNetUpdater | None, options: dict[str, Any]
-    ) -> TargetNetUpdater | None:
+    def _checked(loss: SSPLLoss, updater: TargetNetUpdater | None, options: dict[str, Any]) -> TargetNetUpdater | None:
         """The target-network updater, after a look at what does not go together."""
         if not isinstance(loss, SSPLLoss):
             raise ConfigError(f"expected loss_module to be an SSPLLoss, received {type(loss).__name__}")
@@ -290,18 +286,12 @@ class SSPLTrainer(Trainer):
     def resume(self) -> bool:
         """Continues from the newest complete checkpoint, if there is one.
 
-        Returns:
-            Whether there was one.
-
-        Raises:
-            ConfigError: if the trainer has no ``checkpoint_dir``.
-            CheckpointError: if the checkpoint cannot be read or does not fit.
+        Returns whether there was one. Raises ConfigError if the trainer has no ``checkpoint_dir``; CheckpointError if
+        the checkpoint cannot be read or does not fit.
         """
         rotation = self.checkpoint_rotation
         if rotation is None:
-            raise ConfigError(
-                "expected a trainer with checkpoint_dir to resume, received one without; give the folder"
-            )
+            raise ConfigError("expected a trainer with checkpoint_dir to resume, received one without; give the folder")
         latest: Path | None = rotation.latest()
         if latest is None:
             return False
