@@ -87,18 +87,17 @@ def test_observe_gives_the_previous_frame_first():
     pixels = env.observe(state)
     assert pixels.shape == (1, 6, 64, 64)
     assert pixels.dtype == torch.uint8
-    assert torch.equal(pixels[:, :3], env.render_frame(torch.tensor([0.5 - 2.0 * 0.05])))
-    assert torch.equal(pixels[:, 3:], env.render_frame(torch.tensor([0.5])))
-    assert torch.equal(env.observe(state, previous)[:, :3], env.render_frame(torch.tensor([1.0])))
+    assert torch.equal(pixels[:, :3], env.draw(torch.tensor([[0.5 - 2.0 * 0.05, 0.0]])))
+    assert torch.equal(pixels[:, 3:], env.draw(torch.tensor([[0.5, 0.0]])))
+    assert torch.equal(env.observe(state, previous)[:, :3], env.draw(torch.tensor([[1.0, 0.0]])))
 
 
-def test_observe_gymnasium_agrees_with_observe():
+def test_gymnasiums_pictures_agree_with_its_own():
     pytest.importorskip("pygame")
     env = PendulumEnv()
     state = env.sample_states(10, torch.Generator().manual_seed(0))
-    ours, theirs = env.observe(state), env.observe_gymnasium(state)
+    ours, theirs = env.draw(state), env.renderers()["gymnasium"](state)
     assert (ours.int() - theirs.int()).abs().max() <= 24
-    assert torch.equal(env.observe_gymnasium(state, state)[:, :3], theirs[:, 3:])
 
 
 def test_regions_are_the_papers():

@@ -21,13 +21,7 @@ from torchrl_sspl.sets import UNSAFE, Region, check_disjoint, label
 
 
 def check_tensor(name: str, value: Tensor, dim: int) -> None:
-    """Raise unless ``value`` is a finite floating-point tensor ``(*batch, dim)``.
-
-    Raises:
-        ShapeError: the last dimension is not ``dim``.
-        DTypeError: the dtype is not floating point.
-        NonFiniteError: an entry is NaN or infinite.
-    """
+    """Raise DTypeError, ShapeError or NonFiniteError unless ``value`` is a finite float tensor ``(*batch, dim)``."""
     if not isinstance(value, Tensor) or not value.is_floating_point():
         found = value.dtype if isinstance(value, Tensor) else type(value).__name__
         raise DTypeError(f"{name}: expected a floating-point tensor, received {found}; call .float().")
@@ -48,13 +42,31 @@ def check_positive(**values: float) -> None:
             raise ConfigError(f"{name}: expected a positive finite number, received {value!r}.")
 
 
+def set_specs(env: EnvBase, image_size: int, state_dim: int, bound: Tensor) -> None:
+    """Give an environment of stacked frames its specs; actions are within ``bound``, ``(action_dim,)``, of zero."""
+    shape, device = env.batch_size, env.device
+    entries: dict[str, Any] = {
+        "pixels": Bounded(0, 255, shape=(*shape, 6, image_size, image_size), dtype=torch.uint8, device=device),
+        "region": Categorical(3, shape=(*shape, 1), dtype=torch.int64, device=device),
+    }
+    if state_dim:
+        entries["state"] = Unbounded(shape=(*shape, state_dim), dtype=torch.float32, device=device)
+    env.observation_spec = Composite(entries, shape=shape, device=device)
+    high = bound.expand(*shape, len(bound)).clone()
+    env.action_spec = Bounded(-high, high, shape=high.shape, dtype=torch.float32, device=device)
+    env.reward_spec = Unbounded(shape=(*shape, 1), dtype=torch.float32, device=device)
+    flags = {
+        name: Binary(shape=(*shape, 1), dtype=torch.bool, device=device) for name in ("done", "terminated", "truncated")
+    }
+    env.done_spec = Composite(flags, shape=shape, device=device)
+
+
 class SafetyEnv(EnvBase):
     """A batched system with labelled regions that is seen through two consecutive frames.
 
     A subclass gives the physics and the picture: ``dynamics``, ``wrap``, ``previous_state`` and ``draw``.
     What else is particular to it (names, units, requirements, another renderer, a full physics) are ``system``,
-    ``renderers``, ``known_twin`` and ``physics``, all with defaults.
-    This class gives the TorchRL environment. Output keys, for ``batch_size=[n]``:
+    ``renderers``, ``known_twin`` and ``physics``, all with defaults. Output keys, for ``batch_size=[n]``:
 
     ========== ============================== ============================================================
     key        shape, dtype                   meaning
@@ -71,19 +83,18 @@ class SafetyEnv(EnvBase):
     set_state=True)`` starts at given states. Rollouts carry the previous frame, so nothing is drawn twice.
 
     Args:
-        state_dim, action_dim (int): dimensions of the state and of the action.
-        max_action (float): largest absolute value of an action component, in its physical unit.
-        safe_set, unsafe_set, state_space (Region): labelled sets and the set of all states, in state units.
-        exit_region (int): region label of a state outside the state space. Default ``UNSAFE``.
-        initial_set (Region): where episodes start. Default the state space.
-        batch_size (sequence of int): one entry ``[n]``, or ``[]`` for a single system.
-        image_size (int): height and width H = W of the frames.
-        horizon (int, optional): steps after which an episode is truncated. Default None: never.
+        state_dim, action_dim: dimensions of the state and of the action.
+        max_action: largest absolute value of an action component, in its physical unit.
+        safe_set, unsafe_set, state_space: labelled sets and the set of all states, in state units.
+        exit_region: region label of a state outside the state space.
+        initial_set: where episodes start; None: the state space.
+        batch_size: one entry ``[n]``, or ``[]`` for a single system.
+        image_size: height and width H = W of the frames.
+        horizon: steps after which an episode is truncated; None: never.
         device, seed: device and seed of the environment's own random generator.
 
-    Raises:
-        ConfigError: a parameter is not valid.
-        OverlapError: the safe and the unsafe set share states.
+    Raises ConfigError for a parameter that is not valid, OverlapError if the safe and the unsafe set share states.
+    Source: paper Section II; deviation: none.
     """
 
     _supports_set_state = True
@@ -118,7 +129,7 @@ class SafetyEnv(EnvBase):
         self.exit_region = exit_region
         self.initial_set = state_space if initial_set is None else initial_set
         self.image_size, self.horizon = image_size, horizon
-        self._make_specs()
+        set_specs(self, image_size, state_dim, self.action_high)
         self._generator = torch.Generator(device=self.device)
         if seed is None:
             self._generator.seed()
@@ -128,8 +139,6 @@ class SafetyEnv(EnvBase):
         self._state = torch.zeros(n, state_dim, device=self.device)
         self._frame = torch.zeros(n, 3, image_size, image_size, dtype=torch.uint8, device=self.device)
         self._steps = torch.zeros(n, dtype=torch.int64, device=self.device)
-
-    # -- what a system defines -------------------------------------------------------------------------
 
     @abstractmethod
     def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
@@ -154,7 +163,7 @@ class SafetyEnv(EnvBase):
         return System(f"{type(self).__name__.removesuffix('Env')} from pixels", names, "action")
 
     def renderers(self) -> dict[str, Callable[[Tensor], Tensor]]:
-        """Further renderers by name, states ``(n, state_dim)`` -> uint8 ``(n, 3, H, W)``, on which agents are evaluated too."""
+        """More renderers by name, ``(n, state_dim)`` -> uint8 ``(n, 3, H, W)``; agents are evaluated on them too."""
         return {}
 
     def known_twin(self) -> SafetyEnv:
@@ -165,21 +174,14 @@ class SafetyEnv(EnvBase):
         """Maker of the same system in full physics, with the same regions and actions; None where there is none."""
         return None
 
-    # -- what follows from it --------------------------------------------------------------------------
-
     def observe(self, state: Tensor, previous_state: Tensor | None = None) -> Tensor:
-        """Two stacked frames of given states.
+        """Two stacked frames of given states: uint8 ``(n, 6, H, W)``, frame t-1 (RGB), then frame t (RGB).
 
         Args:
-            state (Tensor): ``(n, state_dim)``, floating point, in physical units.
-            previous_state (Tensor, optional): ``(n, state_dim)``, the state one step earlier. Default: the
-                state that ``previous_state(state)`` reconstructs.
+            state: ``(n, state_dim)``, floating point, in physical units.
+            previous_state: as ``state``, one step earlier; None: what ``previous_state(state)`` reconstructs.
 
-        Returns:
-            Tensor: uint8 ``(n, 6, H, W)``, frame t-1 (RGB), then frame t (RGB).
-
-        Raises:
-            ShapeError, DTypeError, NonFiniteError: ``state`` is not a finite ``(n, state_dim)`` tensor.
+        Raises ShapeError, DTypeError or NonFiniteError for other tensors. Source: paper Section V; deviation: none.
         """
         check_tensor("state", state, self.state_dim)
         if previous_state is None:
@@ -203,13 +205,7 @@ class SafetyEnv(EnvBase):
     def sample_states(
         self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None
     ) -> Tensor:
-        """Draw ``(n, state_dim)`` states uniformly from a region, by default from ``initial_set``.
-
-        Args:
-            n (int): number of states.
-            generator (torch.Generator, optional): default the environment's own.
-            region (Region, optional): where to draw from, for example ``env.safe_set``.
-        """
+        """States ``(n, state_dim)``, uniform in a region (``initial_set``), by a generator (the environment's)."""
         chosen = self.initial_set if region is None else region
         generator = generator or self._generator
         return chosen.sample(n, generator=generator, device=generator.device).to(self.device)
@@ -228,31 +224,6 @@ class SafetyEnv(EnvBase):
         """Check an action ``(*batch, action_dim)`` and clamp it to the bounds."""
         check_tensor("action", action, self.action_dim)
         return action.clamp(-self.max_action, self.max_action)
-
-    # -- TorchRL ---------------------------------------------------------------------------------------
-
-    def _make_specs(self) -> None:
-        shape, device = self.batch_size, self.device
-        size = self.image_size
-        self.observation_spec = Composite(
-            pixels=Bounded(0, 255, shape=(*shape, 6, size, size), dtype=torch.uint8, device=device),
-            state=Unbounded(shape=(*shape, self.state_dim), dtype=torch.float32, device=device),
-            region=Categorical(3, shape=(*shape, 1), dtype=torch.int64, device=device),
-            shape=shape,
-            device=device,
-        )
-        self.action_spec = Bounded(
-            -self.max_action,
-            self.max_action,
-            shape=(*shape, self.action_dim),
-            dtype=torch.float32,
-            device=device,
-        )
-        self.reward_spec = Unbounded(shape=(*shape, 1), dtype=torch.float32, device=device)
-        done = Binary(shape=(*shape, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            done=done.clone(), terminated=done.clone(), truncated=done.clone(), shape=shape, device=device
-        )
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is None:
@@ -307,6 +278,3 @@ class SafetyEnv(EnvBase):
             batch_size=shape,
             device=self.device,
         )
-
-
-__all__ = ["SafetyEnv", "check_positive", "check_tensor"]

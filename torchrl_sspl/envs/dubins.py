@@ -17,10 +17,10 @@ from torchrl_sspl.envs.system import Requirement, System
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.sets import SAFE, Box, Region
 
-OBSTACLE_SHAPES = ("square", "disc")
+_SHAPES = ("square", "disc")
 YAW_LAG = (0.048, 0.063)
 """Turn of the walking robot in one step per yaw rate commanded now and one step before, in s."""
-REQUIREMENTS = (
+_REQUIREMENTS = (
     Requirement("walks_from_safe_hit", "walks from S that hit the obstacle or enter U", "<=", 0.0, 0.0),
     Requirement("walks_from_safe_fall", "walks from S that fall", "<=", 0.0, 0.0),
     Requirement("walks_from_set_enter", "walks from {B <= 0} that enter U", "<=", 0.01, 0.0),
@@ -36,8 +36,8 @@ _LATE = (
     "kernel, and the Dubins episodes in the table, are those of the car that turns at once."
 )
 _PHYSICS = (
-    "What the robot does in full physics is measured by its walks. There position and heading alone do not determine the "
-    "next step; the lag enters as an error that the set tolerates."
+    "What the robot does in full physics is measured by its walks. There position and heading alone do not determine "
+    "the next step; the lag enters as an error that the set tolerates."
 )
 
 
@@ -45,13 +45,9 @@ class Disc(Region):
     r"""States whose first two coordinates lie in a disc, :math:`\|(x, y) - c\| \le r`.
 
     Args:
-        centre (sequence of float): (x, y) in m.
-        radius (float): in m.
-        rest (Box, optional): values of the other coordinates when states are drawn; membership does not depend on
-            them. Default None: the states are (x, y).
-
-    Raises:
-        ConfigError: the radius is not positive.
+        centre, radius: (x, y), and a positive number, in m.
+        rest: values of the other coordinates when states are drawn; membership does not depend on them. None: the
+            states are (x, y).
 
     Source: none.
 
@@ -64,9 +60,10 @@ class Disc(Region):
         check_positive(radius=radius)
         self.centre, self.radius, self.rest = torch.tensor([float(v) for v in centre]), float(radius), rest
         self.dim = 2 if rest is None else 2 + rest.dim
-        #: Corners of the box around it.
-        ends = (torch.zeros(0), torch.zeros(0)) if rest is None else (rest.low, rest.high)
-        self.low, self.high = torch.cat([self.centre - self.radius, ends[0]]), torch.cat([self.centre + self.radius, ends[1]])
+        # Corners of the box around it.
+        low, high = (torch.zeros(0), torch.zeros(0)) if rest is None else (rest.low, rest.high)
+        self.low = torch.cat([self.centre - self.radius, low])
+        self.high = torch.cat([self.centre + self.radius, high])
 
     def outside(self, state: Tensor) -> Tensor:
         """Distance in m to the disc, negative inside, ``(*batch, dim) -> (*batch,)``."""
@@ -112,31 +109,26 @@ class DubinsEnv(SafetyEnv):
     and the same state always gives the same frame.
 
     Args:
-        batch_size (sequence of int): ``[n]`` robots, or ``[]`` for one. Default ``[1]``.
-        max_yaw_rate (float): bound of ``|u|`` in rad/s. Default 2.
-        speed (float): v in m/s. Default 1.
-        dt (float): time step in s. Default 0.1.
-        image_size (int): height and width of the frames. Default 128.
-        arena_half_size, safe_half_size, unsafe_half_size (float): in m; X is a square around the origin, S lies
-            outside and U inside a square (U: a disc for ``obstacle_shape="disc"``) around the obstacle. Default
-            2, 1.5, 0.7.
-        obstacle_shape (str): ``"square"`` (default) or ``"disc"``.
-        obstacle_half_size (float): half of the edge, or the radius, of what stands on the ground, in m. Default 0.3.
-        obstacle_centre (sequence of float): (x, y) of the obstacle in m. Default the origin.
-        yaw_lag (sequence of float, optional): (a, b) in s, see above; ``YAW_LAG`` is what was measured on the walking
-            robot. Default None: a = dt, b = 0.
-        horizon (int, optional): steps after which an episode is truncated. Default None: never.
-        initial_set (Region, optional): where episodes start. Default all of X.
+        batch_size: ``[n]`` robots, or ``[]`` for one.
+        max_yaw_rate: bound of ``|u|`` in rad/s.
+        speed: v in m/s.
+        dt: time step in s.
+        image_size: height and width of the frames.
+        arena_half_size, safe_half_size, unsafe_half_size: in m; X is a square around the origin, S lies outside and U
+            inside a square (U: a disc for ``obstacle_shape="disc"``) around the obstacle.
+        obstacle_shape: ``"square"`` or ``"disc"``.
+        obstacle_half_size: half of the edge, or the radius, of what stands on the ground, in m.
+        obstacle_centre: (x, y) of the obstacle in m.
+        yaw_lag: (a, b) in s, see above; ``YAW_LAG`` is what was measured on the walking robot. None: a = dt, b = 0.
+        horizon: steps after which an episode is truncated; None: never.
+        initial_set: where episodes start; None: all of X.
         device, seed: device, and seed of the environment's own random generator.
 
-    Raises:
-        ConfigError: an unknown shape, a size or rate that is not positive, sizes that are not in order.
-
+    Raises ConfigError for an unknown shape, a size or rate that is not positive, or sizes that are not in order.
     Source: paper, Section IV-B. Deviation: leaving the arena is defined (the paper's formula has no answer); the
     optional yaw lag.
 
     Example:
-        >>> import torch
         >>> env = DubinsEnv(batch_size=[2], max_yaw_rate=2.0, seed=0)
         >>> env.dynamics(torch.tensor([[1.0, 1.0, 0.0]]), torch.tensor([[2.0]]))
         tensor([[1.1000, 1.0000, 0.2000]])
@@ -164,19 +156,12 @@ class DubinsEnv(SafetyEnv):
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
-        if obstacle_shape not in OBSTACLE_SHAPES:
-            raise ConfigError(
-                f"obstacle_shape: expected one of {list(OBSTACLE_SHAPES)}, received {obstacle_shape!r}."
-            )
+        if obstacle_shape not in _SHAPES:
+            raise ConfigError(f"obstacle_shape: expected one of {list(_SHAPES)}, received {obstacle_shape!r}.")
         check_positive(
-            max_yaw_rate=max_yaw_rate,
-            speed=speed,
-            dt=dt,
-            arena_half_size=arena_half_size,
-            safe_half_size=safe_half_size,
-            unsafe_half_size=unsafe_half_size,
-            obstacle_half_size=obstacle_half_size,
-        )
+            max_yaw_rate=max_yaw_rate, speed=speed, dt=dt, arena_half_size=arena_half_size,
+            safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size, obstacle_half_size=obstacle_half_size,
+        )  # fmt: skip
         centre = [float(v) for v in obstacle_centre]
         if len(centre) != 2 or not all(abs(v) <= arena_half_size for v in centre):
             raise ConfigError(f"obstacle_centre: expected (x, y) inside the arena, received {list(obstacle_centre)}.")
@@ -200,20 +185,11 @@ class DubinsEnv(SafetyEnv):
         space = square(arena_half_size, (0.0, 0.0))
         unsafe, obstacle = self._obstacle(obstacle_shape, centre, unsafe_half_size, obstacle_half_size, square)
         super().__init__(
-            state_dim=len(low) + 2,
-            action_dim=1,
-            max_action=max_yaw_rate,
-            safe_set=space - square(safe_half_size, centre),
-            unsafe_set=unsafe,
-            state_space=space,
-            exit_region=SAFE,
-            initial_set=initial_set,
-            batch_size=batch_size,
-            image_size=image_size,
-            horizon=horizon,
-            device=device,
-            seed=seed,
-        )
+            state_dim=len(low) + 2, action_dim=1, max_action=max_yaw_rate,
+            safe_set=space - square(safe_half_size, centre), unsafe_set=unsafe, state_space=space,
+            exit_region=SAFE, initial_set=initial_set,
+            batch_size=batch_size, image_size=image_size, horizon=horizon, device=device, seed=seed,
+        )  # fmt: skip
         self.max_yaw_rate, self.speed, self.dt = float(max_yaw_rate), float(speed), float(dt)
         self.yaw_lag = None if yaw_lag is None else (float(yaw_lag[0]), float(yaw_lag[1]))
         self.obstacle_shape, self.obstacle_half_size = obstacle_shape, float(obstacle_half_size)
@@ -232,7 +208,7 @@ class DubinsEnv(SafetyEnv):
             title="Quadruped: an obstacle, from pixels",
             state_names=("x [m]", "y [m]", "heading [rad]", *(("last yaw rate [rad/s]",) if late else ())),
             action_name="yaw rate [rad/s]",
-            requirements=REQUIREMENTS,
+            requirements=_REQUIREMENTS,
             state_grid=(61, 61, 37, *((5,) if late else ())),
             kernel_grid=(101, 101, 72, *((9,) if late else ())),
             unsafe_grid=(61, 61, 36, *((5,) if late else ())),
@@ -246,12 +222,9 @@ class DubinsEnv(SafetyEnv):
         return DubinsEnv(self.batch_size, horizon=self.horizon, device=self.device, seed=0, **self._geometry())
 
     def physics(self) -> Callable[[], gymnasium.Env]:
-        """Maker of the walking robot with the same obstacle, regions, speed and actions.
+        """Maker of the walking robot (paper, Section IV-B) with the same obstacle, regions, speed and actions.
 
-        Raises:
-            MissingDependencyError: the simulator is not installed.
-
-        Source: paper, Section IV-B.
+        Raises MissingDependencyError without the simulator.
         """
         try:
             importlib.import_module("pybullet")
@@ -281,20 +254,10 @@ class DubinsEnv(SafetyEnv):
         return box, Box([x - half_size, y - half_size], [x + half_size, y + half_size])
 
     def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
-        """One step of the robot; the formula is in the class docstring.
+        """Next state ``(*batch, state_dim)`` by the formula in the class docstring; the heading is not wrapped.
 
-        Args:
-            state (Tensor): ``(*batch, 3)`` (m, m, rad), floating point; with a yaw lag ``(*batch, 4)``, the last
-                entry being the command of the step before in rad/s.
-            action (Tensor): ``(*batch, 1)`` yaw rate in rad/s; clamped to ``max_yaw_rate``.
-
-        Returns:
-            Tensor: of the shape of ``state``; the heading is not wrapped, see ``wrap``.
-
-        Raises:
-            ShapeError, DTypeError, NonFiniteError: an argument is not a finite tensor of the expected shape.
-
-        Source: paper, Section IV-B. Deviation: the optional yaw lag.
+        The yaw rate ``(*batch, 1)`` in rad/s is clamped to ``max_yaw_rate``. Source: paper, Section IV-B; deviation:
+        the optional yaw lag.
         """
         check_tensor("state", state, self.state_dim)
         action = self.clamp_action(action)
@@ -339,6 +302,3 @@ class DubinsEnv(SafetyEnv):
     def draw(self, state: Tensor) -> Tensor:
         """RGB frames of states, ``(*batch, state_dim) -> uint8 (*batch, 3, H, W)``."""
         return self._compositor(state[..., :3], self.gait_phase(state))
-
-
-__all__ = ["OBSTACLE_SHAPES", "YAW_LAG", "Disc", "DubinsEnv"]

@@ -11,10 +11,10 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torch.nn import functional as F
-from torchrl.data import Binary, Bounded, Categorical, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from torchrl_sspl.devices import usable_device
+from torchrl_sspl.envs.base import set_specs
 from torchrl_sspl.errors import ConfigError, OverlapError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
@@ -26,8 +26,8 @@ class GymnasiumPixels(EnvBase):
     r"""A gymnasium environment seen through its own pictures, labelled by two predicates.
 
     The networks see pixels only: gymnasium's observation where that is a uint8 picture (height, width, 3), else what it
-    renders. The predicates see what gymnasium returns, its observation and its info, and
-    are asked after every step; what neither of them claims is unlabelled. Output keys, for ``batch_size=[n]``:
+    renders. The predicates are asked after every step; what neither of them claims is unlabelled. Output keys, for
+    ``batch_size=[n]``:
 
     ========== ============================ ==============================================================
     key        shape, dtype                 meaning
@@ -41,36 +41,32 @@ class GymnasiumPixels(EnvBase):
 
     Actions lie in a box around zero. For a ``Box`` of gymnasium the action is the distance from its middle, in its
     own units: :math:`u_{gym} = (low + high) / 2 + u`. For ``Discrete(k)`` the interval [-1, 1] is cut into k equal
-    parts, in the order of gymnasium's numbers; with r repetitions into :math:`(k - 1) r + 1`, so that neighbouring numbers
-    mix: part j is the number :math:`\lfloor j / r \rfloor + 1` in the first :math:`j \bmod r` repetitions and
-    :math:`\lfloor j / r \rfloor` in the others.
+    parts, in the order of gymnasium's numbers; with r repetitions into :math:`(k - 1) r + 1`, so that neighbouring
+    numbers mix: part j is the number :math:`\lfloor j / r \rfloor + 1` in the first :math:`j \bmod r` repetitions
+    and :math:`\lfloor j / r \rfloor` in the others.
 
     A reset is followed by one step with the action zero, so that the two first frames show motion. Where systems start
     at rest, ``settle=False`` leaves the step out, and the two first frames are the same.
 
     Args:
         make: ``() -> gymnasium.Env``, with ``render_mode="rgb_array"`` unless it observes pictures; called n times.
-        safe: ``(observation, info) -> bool``, the set S.
-        unsafe: ``(observation, info) -> bool``, the set U.
+        safe, unsafe: ``(observation, info) -> bool`` of what gymnasium returns, the sets S and U.
         batch_size: ``[n]`` environments, stepped one after the other.
         image_size: height and width of the frames, in pixels; pictures are averaged down to it.
         horizon: steps after which an episode is truncated; ``None`` leaves that to gymnasium.
         reset_options: ``options`` of gymnasium's reset, or ``(numpy generator) -> options``.
-        action_repeat: steps of gymnasium per step, all with the same action, of a discrete one with the mixture above; the two
-            frames of an observation, and what the predicates judge, lie that far apart. Where a step moves less than the
-            picture shows, it makes motion visible; of discrete actions it makes finer ones.
+        action_repeat: steps of gymnasium per step, all with the same action, of a discrete one with the mixture above;
+            the two frames of an observation, and what the predicates judge, lie that far apart. Where a step moves less
+            than the picture shows, it makes motion visible; of discrete actions it makes finer ones.
         settle: let one step pass after a reset.
         ignore_termination: let episodes go on where gymnasium ends them, up to ``horizon``: where it ends them in U, no
             transition would start there. The system has to bear it (those of gymnasium do, with a warning).
         device: device of the tensors.
         seed: seed of the resets.
 
-    Raises:
-        ConfigError: the environment cannot draw itself, or its action space is neither a bounded ``Box`` nor
-            ``Discrete``.
-        OverlapError: during a run, if both predicates claim a state.
-
-    Source: none; the paper has two systems of its own.
+    Raises ConfigError if the environment cannot draw itself, or its action space is neither a bounded ``Box`` nor
+    ``Discrete``; OverlapError, during a run, if both predicates claim a state. Source: none; the paper has two systems
+    of its own.
 
     Example:
         >>> import gymnasium
@@ -113,8 +109,8 @@ class GymnasiumPixels(EnvBase):
             raise ConfigError(f"image_size: expected an integer >= 8, received {image_size!r}.")
         if not callable(make):
             raise ConfigError(
-                "make: expected a function that makes an environment of gymnasium, such as partial(gymnasium.make, 'CartPole-v1', "
-                f"render_mode='rgb_array'), received an object of type {type(make).__name__}."
+                "make: expected a function that makes an environment of gymnasium, such as partial(gymnasium.make, "
+                f"'CartPole-v1', render_mode='rgb_array'), received an object of type {type(make).__name__}."
             )
         super().__init__(device=usable_device(device or "cpu"), batch_size=size)
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
@@ -134,14 +130,12 @@ class GymnasiumPixels(EnvBase):
             )
         self._read_action_space(first.action_space)
         self.state_dim = shape[0] if len(shape) == 1 else 0
-        self._make_specs()
+        set_specs(self, image_size, self.state_dim, torch.tensor(self._scale, device=self.device))
         self._random = np.random.default_rng(seed)
         n = size[0]
         self._frame = torch.zeros(n, 3, image_size, image_size, dtype=torch.uint8)
         self._steps = [0] * n
         self._last: list[dict[str, Any]] = [{} for _ in range(n)]
-
-    # -- spaces ----------------------------------------------------------------------------------------
 
     def _read_action_space(self, space: Any) -> None:
         self._choices: int | None = None
@@ -174,25 +168,6 @@ class GymnasiumPixels(EnvBase):
             return [self._start + lower + (step < more) for step in range(repeat)]
         return [(self._middle + bounded).reshape(self._action_shape).astype(self._action_dtype)] * repeat
 
-    def _make_specs(self) -> None:
-        shape, device, size = self.batch_size, self.device, self.image_size
-        entries: dict[str, Any] = {
-            "pixels": Bounded(0, 255, shape=(*shape, 6, size, size), dtype=torch.uint8, device=device),
-            "region": Categorical(3, shape=(*shape, 1), dtype=torch.int64, device=device),
-        }
-        if self.state_dim:
-            entries["state"] = Unbounded(shape=(*shape, self.state_dim), dtype=torch.float32, device=device)
-        self.observation_spec = Composite(entries, shape=shape, device=device)
-        high = torch.tensor(self._scale, device=device).expand(*shape, self.action_dim).clone()
-        self.action_spec = Bounded(-high, high, shape=high.shape, dtype=torch.float32, device=device)
-        self.reward_spec = Unbounded(shape=(*shape, 1), dtype=torch.float32, device=device)
-        flag = Binary(shape=(*shape, 1), dtype=torch.bool, device=device)
-        self.done_spec = Composite(
-            done=flag.clone(), terminated=flag.clone(), truncated=flag.clone(), shape=shape, device=device
-        )
-
-    # -- one environment -------------------------------------------------------------------------------
-
     def _draw(self, index: int, observation: Any) -> Tensor:
         shown = observation if self._observes_pictures else self._envs[index].render()
         picture = np.array(shown)  # a copy: some renderers draw into the same memory again
@@ -207,7 +182,8 @@ class GymnasiumPixels(EnvBase):
         return frame
 
     def _region(self, observation: Any, info: Mapping[str, Any]) -> int:
-        safe, unsafe = (self._judged(name, observation, info) for name in ("safe", "unsafe"))
+        judges = (("safe", self._safe), ("unsafe", self._unsafe))
+        safe, unsafe = (self._judged(name, predicate, observation, info) for name, predicate in judges)
         if safe and unsafe:
             raise OverlapError(
                 "safe and unsafe: expected predicates that exclude each other, received a state that both claim; "
@@ -215,12 +191,14 @@ class GymnasiumPixels(EnvBase):
             )
         return SAFE if safe else UNSAFE if unsafe else UNLABELLED
 
-    def _judged(self, name: str, observation: Any, info: Mapping[str, Any]) -> bool:
+    @staticmethod
+    def _judged(name: str, predicate: Predicate, observation: Any, info: Mapping[str, Any]) -> bool:
         try:
-            return bool(self._safe(observation, info) if name == "safe" else self._unsafe(observation, info))
+            return bool(predicate(observation, info))
         except (TypeError, ValueError, LookupError) as error:
             raise ConfigError(
-                f"{name}: expected a predicate (observation, info) -> bool of one state, received {type(error).__name__}: {error}"
+                f"{name}: expected a predicate (observation, info) -> bool of one state, received "
+                f"{type(error).__name__}: {error}"
             ) from error
 
     def _options(self) -> dict[str, Any] | None:
@@ -259,7 +237,8 @@ class GymnasiumPixels(EnvBase):
                 break
         else:
             raise ConfigError(
-                f"reset: expected an episode that survives one step, received {_ATTEMPTS} that did not; change reset_options."
+                f"reset: expected an episode that survives one step, received {_ATTEMPTS} that did not; "
+                "change reset_options."
             )
         self._frame[index] = self._draw(index, observation)
         self._steps[index] = 0
@@ -271,8 +250,6 @@ class GymnasiumPixels(EnvBase):
         if self.state_dim:
             row["state"] = np.asarray(observation, np.float32)
         return row
-
-    # -- TorchRL ---------------------------------------------------------------------------------------
 
     def _set_seed(self, seed: int | None) -> None:
         self._random = np.random.default_rng(seed)
@@ -319,6 +296,3 @@ class GymnasiumPixels(EnvBase):
         for env in self._envs:
             env.close()
         super().close(raise_if_closed=raise_if_closed)
-
-
-__all__ = ["GymnasiumPixels"]

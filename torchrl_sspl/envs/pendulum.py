@@ -12,10 +12,10 @@ from torch import Tensor
 from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
 from torchrl_sspl.envs.system import Requirement, System
-from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.sets import Box, Region
 
-INTEGRATORS = ("semi_implicit", "explicit")
+_INTEGRATORS = ("semi_implicit", "explicit")
 SYSTEM = System(
     title="Inverted pendulum from pixels",
     state_names=("angle [rad]", "angular velocity [rad/s]"),
@@ -52,27 +52,22 @@ class PendulumEnv(SafetyEnv):
     speed leaves X ends the episode and counts as unsafe. Output keys: see ``SafetyEnv``.
 
     Args:
-        batch_size (sequence of int): ``[n]`` pendulums, or ``[]`` for one. Default ``[1]``.
-        image_size (int): height and width of the frames. Default 64.
-        integrator (str): ``"semi_implicit"`` (default) or ``"explicit"``.
-        max_torque (float): bound of ``|u|`` in N m. Default 10.
-        mass, length, gravity (float): in kg, m, m/s^2. Default 1, 1, 10.
-        dt (float): time step in s. Default 0.05.
-        horizon (int, optional): steps after which an episode is truncated. Default None: never.
-        snap (bool): draw with gymnasium's whole-pixel corners (default) or continuously in the angle; see
-            ``PendulumRenderer``.
-        safe_set, unsafe_set, state_space, initial_set (Region, optional): in place of S, U, X; episodes
-            start in ``initial_set``, by default all of X.
+        batch_size: ``[n]`` pendulums, or ``[]`` for one.
+        image_size: height and width of the frames.
+        integrator: ``"semi_implicit"`` or ``"explicit"``.
+        max_torque: bound of ``|u|`` in N m.
+        mass, length, gravity: in kg, m, m/s^2.
+        dt: time step in s.
+        horizon: steps after which an episode is truncated; None: never.
+        snap: draw with gymnasium's whole-pixel corners, else continuously in the angle; see ``PendulumRenderer``.
+        safe_set, unsafe_set, state_space: in place of S, U, X.
+        initial_set: where episodes start; None: all of X.
         device, seed: device, and seed of the environment's own random generator.
 
-    Raises:
-        ConfigError: an unknown integrator, or a parameter that is not positive.
-        OverlapError: the safe and the unsafe set share states.
-
-    Source: paper, Section V-A. Deviation: the semi-implicit step is the default (see above).
+    Raises ConfigError for an unknown integrator or a parameter that is not positive; OverlapError if the safe and the
+    unsafe set share states. Source: paper, Section V-A. Deviation: the semi-implicit step is the default (see above).
 
     Example:
-        >>> import torch
         >>> env = PendulumEnv(batch_size=[2], seed=0)
         >>> env.dynamics(torch.tensor([[0.0, 1.0]]), torch.tensor([[10.0]]))
         tensor([[0.0750, 1.5000]])
@@ -101,8 +96,8 @@ class PendulumEnv(SafetyEnv):
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
-        if integrator not in INTEGRATORS:
-            raise ConfigError(f"integrator: expected one of {list(INTEGRATORS)}, received {integrator!r}.")
+        if integrator not in _INTEGRATORS:
+            raise ConfigError(f"integrator: expected one of {list(_INTEGRATORS)}, received {integrator!r}.")
         check_positive(max_torque=max_torque, mass=mass, length=length, gravity=gravity, dt=dt)
         renderer = PendulumRenderer(image_size, snap=snap, device=device)
         turn = [2 * math.pi, 0.0]
@@ -113,37 +108,19 @@ class PendulumEnv(SafetyEnv):
         if unsafe_set is None:
             unsafe_set = state_space - Box([-math.pi / 2, -1.5], [math.pi / 2, 1.5], period=turn)
         super().__init__(
-            state_dim=2,
-            action_dim=1,
-            max_action=max_torque,
-            safe_set=safe_set,
-            unsafe_set=unsafe_set,
-            state_space=state_space,
-            initial_set=initial_set,
-            batch_size=batch_size,
-            image_size=image_size,
-            horizon=horizon,
-            device=device,
-            seed=seed,
-        )
+            state_dim=2, action_dim=1, max_action=max_torque,
+            safe_set=safe_set, unsafe_set=unsafe_set, state_space=state_space, initial_set=initial_set,
+            batch_size=batch_size, image_size=image_size, horizon=horizon, device=device, seed=seed,
+        )  # fmt: skip
         self.integrator, self.max_torque = integrator, float(max_torque)
         self.mass, self.length, self.gravity, self.dt = mass, length, gravity, dt
         self._renderer = renderer
 
     def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
-        """One step of the pendulum; the formula is in the class docstring.
+        """Next state ``(*batch, 2)`` (rad, rad/s) by the formula in the class docstring; the angle is not wrapped.
 
-        Args:
-            state (Tensor): ``(*batch, 2)``, floating point, (rad, rad/s).
-            action (Tensor): ``(*batch, 1)`` torque in N m; clamped to ``max_torque``, as gymnasium does.
-
-        Returns:
-            Tensor: ``(*batch, 2)``; the angle is not wrapped, see ``wrap``.
-
-        Raises:
-            ShapeError, DTypeError, NonFiniteError: an argument is not a finite tensor of the expected shape.
-
-        Source: paper, Section V-A (``integrator="explicit"``). Deviation: the semi-implicit default.
+        The torque ``(*batch, 1)`` in N m is clamped to ``max_torque``, as gymnasium does. Source: paper, Section V-A
+        (explicit); deviation: the semi-implicit default.
         """
         check_tensor("state", state, 2)
         action = self.clamp_action(action)
@@ -161,9 +138,8 @@ class PendulumEnv(SafetyEnv):
     def previous_state(self, state: Tensor) -> Tensor:
         """State one step earlier under zero torque, ``(*batch, 2) -> (*batch, 2)``.
 
-        For the semi-implicit step its angle is exact for every torque: theta - thetadot dt. For the
-        explicit step it is one of the angles that the unseen torque allows, a range of +- max_torque dt^2 /
-        (m l^2).
+        For the semi-implicit step its angle is exact for every torque: theta - thetadot dt. For the explicit step it is
+        one of the angles that the unseen torque allows, a range of +- max_torque dt^2 / (m l^2).
         """
         check_tensor("state", state, 2)
         angle, speed = state[..., :1], state[..., 1:]
@@ -178,7 +154,7 @@ class PendulumEnv(SafetyEnv):
 
     def draw(self, state: Tensor) -> Tensor:
         """RGB frames of states, ``(*batch, 2) -> uint8 (*batch, 3, H, W)``."""
-        return self.render_frame(state[..., 0])
+        return self._renderer(state[..., 0])
 
     @property
     def system(self) -> System:
@@ -186,42 +162,11 @@ class PendulumEnv(SafetyEnv):
         return SYSTEM
 
     def renderers(self) -> dict[str, Callable[[Tensor], Tensor]]:
-        """Gymnasium's own pictures, see ``observe_gymnasium``; drawing raises ``MissingDependencyError`` without pygame."""
+        """Gymnasium's own Pendulum-v1 pictures, see ``GymnasiumRenderer``; MissingDependencyError without pygame."""
         return {"gymnasium": lambda state: _gymnasium_renderer(self.image_size)(state[..., 0])}
-
-    def render_frame(self, angle: Tensor) -> Tensor:
-        """RGB frames of angles, ``(n,)`` rad -> uint8 ``(n, 3, H, W)``; see ``PendulumRenderer``."""
-        return self._renderer(angle)
-
-    def observe_gymnasium(self, state: Tensor, previous_state: Tensor | None = None) -> Tensor:
-        """Observe as ``observe`` does, with every frame drawn by gymnasium's own Pendulum-v1 renderer.
-
-        Different pictures are drawn once (about 3 ms each) and kept; see ``GymnasiumRenderer``.
-
-        Args:
-            state (Tensor): ``(n, 2)``, (rad, rad/s).
-            previous_state (Tensor, optional): as for ``observe``.
-
-        Returns:
-            Tensor: uint8 ``(n, 6, H, W)``.
-
-        Raises:
-            MissingDependencyError: pygame is not installed.
-            ShapeError, DTypeError, NonFiniteError: the states are not finite ``(n, 2)`` tensors.
-        """
-        check_tensor("state", state, 2)
-        before = self.previous_state(state) if previous_state is None else previous_state
-        check_tensor("previous_state", before, 2)
-        if before.shape != state.shape:
-            raise ShapeError(f"previous_state: expected shape {tuple(state.shape)}, received {tuple(before.shape)}.")
-        renderer = _gymnasium_renderer(self.image_size)
-        return torch.cat([renderer(before[..., 0]), renderer(state[..., 0])], dim=-3)
 
 
 @functools.lru_cache(maxsize=4)
 def _gymnasium_renderer(image_size: int) -> GymnasiumRenderer:
     """One table of gymnasium's pictures per frame size, shared by all environments of the process."""
     return GymnasiumRenderer(image_size)
-
-
-__all__ = ["INTEGRATORS", "PendulumEnv"]

@@ -22,9 +22,7 @@ _GROW = 0.5  # filled polygons cover their boundary pixels as well
 _GAUSS = 0.5 / math.sqrt(3.0)  # two-point Gauss node on [-1/2, 1/2]
 _CHUNK = 128  # frames at a time: the intermediate tensors stay in the cache
 
-BACKGROUND = (255, 255, 255)
-ROD_COLOUR = (204, 77, 77)
-AXLE_COLOUR = (0, 0, 0)
+_WHITE, _ROD_COLOUR = (255, 255, 255), (204, 77, 77)
 
 
 class PendulumRenderer:
@@ -35,22 +33,20 @@ class PendulumRenderer:
     a straight line (two-point Gauss quadrature, exact for edges along the axes); the round ends replace it
     beyond the short edges. Only the square that the rod can reach is computed.
 
-    gymnasium draws with integer coordinates, so its picture jumps as the angle moves: about 2,700 different
-        pictures in a full turn. ``snap=True`` rounds the corners of the rod exactly as it does and
-        reproduces its picture (largest error of any pixel about 12/255 over thousands of angles).
-        ``snap=False`` draws the picture that it approximates, continuous in the angle (largest error about
-        25/255, caused by the rounding).
+    gymnasium draws with integer coordinates, so its picture jumps as the angle moves: about 2,700 different pictures in
+    a full turn.
 
     Args:
-        image_size (int): height and width of the frames, in pixels; at least 16. Default 64.
-        snap (bool): round corners to whole pixels of the 500 x 500 screen, as gymnasium does. Default True.
-        device: device of the frames. Default the device of the angles.
+        image_size: height and width of the frames, in pixels; at least 16.
+        snap: round the corners of the rod to whole pixels of the 500 x 500 screen exactly as gymnasium does (largest
+            error of any pixel about 12/255 over thousands of angles); False: draw the picture that it approximates,
+            continuous in the angle (largest error about 25/255, caused by the rounding).
+        device: device of the frames.
 
-    Source: gymnasium 1.x, ``envs/classic_control/pendulum.py``; the paper (Section V-A) uses its frames.
-    Deviation: the torque arrow, which would show the action in the observation, is never drawn.
+    Source: gymnasium 1.x, ``envs/classic_control/pendulum.py``; the paper (Section V-A) uses its frames. Deviation: the
+    torque arrow, which would show the action in the observation, is never drawn.
 
     Example:
-        >>> import torch
         >>> frames = PendulumRenderer(image_size=64)(torch.tensor([0.0, 1.0]))
         >>> frames.shape, frames.dtype
         (torch.Size([2, 3, 64, 64]), torch.uint8)
@@ -77,23 +73,14 @@ class PendulumRenderer:
         distance = torch.hypot(dx, dy)
         self._pivot = (distance < _CAP_RADIUS * scale).float().mean((-1, -2))
         axle = (distance < _AXLE_RADIUS * scale).float().mean((-1, -2))
-        # White where nothing is drawn; black replaces the rod's colour (not white) under the axle. + 0.5
-        # rounds.
-        self._ground = [white + 0.5 - rod * axle for white, rod in zip(BACKGROUND, ROD_COLOUR, strict=True)]
+        # White where nothing is drawn; black replaces the rod's colour (not white) under the axle. + 0.5 rounds.
+        self._ground = [white + 0.5 - rod * axle for white, rod in zip(_WHITE, _ROD_COLOUR, strict=True)]
 
     def __call__(self, angle: Tensor) -> Tensor:
-        """Draw the frames of a batch of angles.
+        """Draw uint8 ``(*batch, 3, image_size, image_size)`` of angles ``(*batch,)`` in rad.
 
-        Args:
-            angle (Tensor): ``(*batch,)``, floating point, rad; 0 is upright, positive is
-                counter-clockwise.
-
-        Returns:
-            Tensor: uint8 ``(*batch, 3, image_size, image_size)``.
-
-        Raises:
-            DTypeError: the angles are not floating point.
-            NonFiniteError: an angle is NaN or infinite.
+        An angle of 0 is upright, positive is counter-clockwise. Raises DTypeError or NonFiniteError for angles that are
+        no finite floating-point numbers.
         """
         if not angle.is_floating_point():
             raise DTypeError(f"angle: expected floating point, received {angle.dtype}; call .float().")
@@ -107,10 +94,8 @@ class PendulumRenderer:
             part = slice(start, start + _CHUNK)
             window = frames[part, :, self._window, self._window]
             coverage = self._coverage(*self._corners(flat[part]))
-            red = torch.sub(self._ground[0], coverage, alpha=BACKGROUND[0] - ROD_COLOUR[0])
-            green = torch.sub(self._ground[1], coverage, alpha=BACKGROUND[1] - ROD_COLOUR[1])
-            window[:, 0].copy_(red)
-            window[:, 1].copy_(green)
+            for k in range(2):
+                window[:, k].copy_(torch.sub(self._ground[k], coverage, alpha=_WHITE[k] - _ROD_COLOUR[k]))
             window[:, 2].copy_(window[:, 1])  # green and blue are the same in all three colours
         return frames.reshape(*angle.shape, 3, size, size)
 
@@ -134,9 +119,9 @@ class PendulumRenderer:
     def _edge(self, start: Tensor, end: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Line through two points as ``column + row``: the signed distance that a box filter sees, plus 1/2.
 
-        The distance (positive on the left of ``start -> end``) is divided by the larger component of the
-        normal, so that ``clamp(column + row, 0, 1)`` is the covered part of a segment through the pixel
-        along that axis; the third result shifts the segment to the two Gauss nodes across it.
+        The distance (positive on the left of ``start -> end``) is divided by the larger component of the normal, so
+        that ``clamp(column + row, 0, 1)`` is the covered part of a segment through the pixel along that axis; the third
+        result shifts the segment to the two Gauss nodes across it.
         """
         direction = end - start
         normal = torch.stack([-direction[:, 1], direction[:, 0]], dim=-1)
@@ -151,13 +136,11 @@ class PendulumRenderer:
     def _coverage(self, corners: Tensor, tip: Tensor) -> Tensor:
         """Part of each pixel of the window that the rod covers, ``(n, window, window)`` in [0, 1]."""
         a, b, c, d = corners.unbind(1)
-        coverage = None
+        halves = []
         for start, end in ((a, d), (c, b)):  # the long edges, with the rod on their left
             column, row, shift = self._edge(start, end)
-            half = ((column + shift) + row).clamp_(0, 1).add_(((column - shift) + row).clamp_(0, 1))
-            coverage = half if coverage is None else coverage.add_(half)
-        assert coverage is not None
-        coverage.mul_(0.5).sub_(1).clamp_(min=0)
+            halves.append(((column + shift) + row).clamp_(0, 1).add_(((column - shift) + row).clamp_(0, 1)))
+        coverage = halves[0].add_(halves[1]).mul_(0.5).sub_(1).clamp_(min=0)
         # Beyond the short edges the round caps take over. A box filter moves the border of a disc of radius r
         # inwards by 1 / (24 r).
         radius = _CAP_RADIUS * self._scale
@@ -174,20 +157,14 @@ class PendulumRenderer:
 class GymnasiumRenderer:
     """Frames drawn by gymnasium's own Pendulum-v1 renderer and area-averaged, for evaluation.
 
-    gymnasium's picture is constant between the angles at which a corner of the rod crosses a whole pixel.
-    Those angles are known in closed form, so every different picture is drawn by gymnasium once (about 3
-    ms), kept, and looked up afterwards; all of them together (about 3,000) take 36 MB at 64 x 64.
+    gymnasium's picture is constant between the angles at which a corner of the rod crosses a whole pixel. Those angles
+    are known in closed form, so every different picture is drawn by gymnasium once (about 3 ms), kept, and looked up
+    afterwards; all of them together (about 3,000) take 36 MB at 64 x 64. ``image_size``: height and width in pixels.
 
-    Args:
-        image_size (int): height and width of the frames, in pixels. Default 64.
-
-    Raises:
-        MissingDependencyError: pygame, which gymnasium draws with, is not installed.
-
-    Source: the frames of the paper's Section V-A. Deviation: none.
+    Raises MissingDependencyError without pygame, which gymnasium draws with. Source: the frames of the paper's
+    Section V-A; deviation: none.
 
     Example:
-        >>> import torch
         >>> GymnasiumRenderer(image_size=64)(torch.tensor([0.0])).shape
         torch.Size([1, 3, 64, 64])
     """
@@ -216,11 +193,7 @@ class GymnasiumRenderer:
         self._area = (overlap.clamp_min(0) * image_size / _SCREEN).float()
 
     def __call__(self, angle: Tensor) -> Tensor:
-        """Look up, and where necessary draw, the frames of a batch of angles ``(*batch,)`` in rad.
-
-        Returns:
-            Tensor: uint8 ``(*batch, 3, image_size, image_size)`` on the device of the angles.
-        """
+        """Look up, and where necessary draw, uint8 ``(*batch, 3, H, W)`` of angles ``(*batch,)`` in rad."""
         turn = 2 * math.pi
         wrapped = angle.detach().cpu().double().reshape(-1).remainder(turn)
         # Cell k lies between border k and border k + 1; before the first border begins the last cell.
@@ -260,6 +233,3 @@ def _picture_borders() -> Tensor:
             borders.append(root - phase - math.pi / 2)
     angles = torch.cat(borders).remainder(2 * math.pi).sort().values
     return angles[torch.cat([torch.ones(1, dtype=torch.bool), angles.diff() > 1e-12])]
-
-
-__all__ = ["AXLE_COLOUR", "BACKGROUND", "ROD_COLOUR", "GymnasiumRenderer", "PendulumRenderer"]

@@ -8,16 +8,9 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Requirement:
-    """One row of a table of requirements.
+    """One row of a table of requirements: a measurement has to be ``sense`` ("<=" or ">=") ``must``, better even ``aim``.
 
-    Attributes:
-        name: name of the measurement.
-        label: what it is, for people.
-        sense: "<=" or ">=".
-        must: value that has to be reached.
-        aim: value that one would like to reach.
-
-    Source: none.
+    ``name`` is that of the measurement, ``label`` says to people what it is. Source: none.
 
     Example:
         >>> from types import SimpleNamespace
@@ -33,7 +26,7 @@ class Requirement:
     aim: float
 
     def verdict(self, evaluation: Any) -> str:
-        """"aim", "must", "missed by x" or "not measured", of an evaluation with ``measurements`` by name."""
+        """Of an evaluation with ``measurements`` by name: "aim", "must", "missed by x" or "not measured"."""
         measured = evaluation.measurements.get(self.name)
         if measured is None or measured.value is None:
             return "not measured"
@@ -48,16 +41,15 @@ class Requirement:
 class System:
     """Everything about a system that evaluations and reports need beyond its dynamics, regions and pictures.
 
-    Attributes:
+    Args:
         title: title of its reports.
-        state_names: name and unit of every state coordinate.
-        action_name: name and unit of the action.
+        state_names, action_name: name and unit of every state coordinate, and of the action.
         requirements: what its agents have to reach.
-        state_grid: nodes per state coordinate of the evaluation's grid, corners included (of a periodic coordinate the last
-            node is the first again): one number, or one for each.
-        kernel_grid: nodes per state coordinate of the grid of the true kernel.
-        unsafe_grid: nodes per state coordinate of a grid of its own over U, a periodic coordinate without its last node; None:
-            the nodes of ``state_grid`` in U.
+        state_grid: nodes per state coordinate (one number, or one for each) of the evaluation's grid, corners included;
+            of a periodic coordinate the last node is the first again.
+        kernel_grid: the same of the grid of the true kernel.
+        unsafe_grid: the same of a grid of its own over U, a periodic coordinate without its last node; None: the nodes of
+            ``state_grid`` in U.
         action_direction: direction of a positive action in the plane of the first two coordinates (a torque pushes the
             angular velocity: ``(0, 1)``), for figures; None: along the path.
         notes: what a report has to say about this system.
@@ -78,6 +70,3 @@ class System:
     unsafe_grid: tuple[int, ...] | None = None
     action_direction: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
-
-
-__all__ = ["Requirement", "System"]
