@@ -17,19 +17,13 @@ from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
 
 
 def interpolate(table: Tensor, action: Tensor, *, action_scale: float | Tensor) -> Tensor:
-    r"""Values of actions between those of a regular grid, by multilinear interpolation.
+    """Values ``(n, 1)`` of actions between those of a regular grid, multilinear and differentiable in the actions.
 
     Args:
-        table: ``(n, k^m)`` values of the grid with k points per dimension from ``-action_scale`` to ``action_scale``,
-            in the order of ``torch.cartesian_prod``.
+        table: ``(n, k^m)`` values of k >= 2 points per dimension from ``-action_scale`` to ``action_scale``, in the
+            order of ``torch.cartesian_prod``; any other number of columns is a ShapeError.
         action: ``(n, m)`` in physical units; clamped to the grid.
         action_scale: largest action, a number or ``(m,)``.
-
-    Returns:
-        ``(n, 1)`` values, differentiable in the actions.
-
-    Raises:
-        ShapeError: if the table does not have ``k^m`` columns for some k of at least 2.
 
     Source: none.
 
@@ -66,44 +60,31 @@ class ActionValueLoss(LatentLoss):
 
     with Q between the tabulated actions by multilinear interpolation. Where two actions are as good and what lies
     between them is not, as left and right of an obstacle ahead, a regression onto the mean of the best would teach the
-    worst; this loss decides for a side. Where the action does not matter it asks for nothing.
+    worst; this loss decides for a side. Where the action does not matter it asks for nothing. Output:
+    ``loss_action_value``. Source: none; the paper trains the policy on the condition alone.
 
     Args:
         policy: latent -> action ``(*batch, action_dim)`` in physical units.
         action_scale: largest action, end of the grid of actions; a number or one per dimension.
         scale: s, in units of the values.
-        **shared: ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`.
-
-    Returns:
-        ``forward`` returns a tensordict with ``loss_action_value``.
-
-    Raises:
-        ConfigError: if an option is not valid, or an entry of the batch is missing.
-        ShapeError: if the table does not fit the action.
-
-    Source: none; the paper trains the policy on the condition alone.
+        **shared: ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`, for errors too.
 
     Example:
         >>> from torchrl_sspl.modules import Policy
-        >>> loss = ActionValueLoss(Policy(2, 1))
         >>> rows = TensorDict(latent=torch.rand(4, 2), action_value=torch.rand(4, 11), batch_size=4)
-        >>> loss(rows)["loss_action_value"].shape
+        >>> ActionValueLoss(Policy(2, 1))(rows)["loss_action_value"].shape
         torch.Size([])
     """
 
     @dataclass
     class _AcceptedKeys(LatentLoss._AcceptedKeys):
-        """Keys that can be changed with ``set_keys``.
+        """Keys that can be changed with ``set_keys``."""
 
-        Attributes:
-            action_value: ``(*batch, k^m)`` values of a regular grid of actions.
-        """
-
-        action_value: NestedKey = "action_value"
+        action_value: NestedKey = "action_value"  # (*batch, k^m) values of a regular grid of actions
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    action_scale: Tensor
+    _reads = ("action_value",)
 
     def __init__(
         self, policy: nn.Module, *, action_scale: float | Sequence[float] = 1.0, scale: float = 1.0, **shared: Any
@@ -114,11 +95,6 @@ class ActionValueLoss(LatentLoss):
         self.scale = float(scale)
         self._set_action_scale(action_scale)
         self.out_keys.append("loss_action_value")
-
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        assert self._in_keys is not None
-        self._in_keys.append(self.tensor_keys.action_value)
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
 import torch
@@ -19,21 +19,23 @@ from torchrl.objectives import LossModule
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
 from torchrl_sspl.modules import as_tensordict_module
 
-REDUCTIONS = ("none", "mean", "sum")
+_REDUCTIONS = ("none", "mean", "sum")
 _ABSENT: Any = None
+_Leaf = tuple[dict[str, Any], str, Tensor]
+_LEAVES: WeakKeyDictionary[LossModule, dict[str, list[_Leaf]]] = WeakKeyDictionary()
 
 
 @dataclass
 class LatentBatch:
-    """A batch as the terms of the losses see it.
+    r"""A batch as the terms of the losses see it; what no active term needs may be missing.
 
     Attributes:
-        latent: ``(*batch, p)`` online latent :math:`E_\\theta(o_t)`.
-        next_latent: ``(*batch, p)`` online :math:`E_\\theta(o_{t+1})`, where a term needs it.
-        target_latent: ``(*batch, p)`` delayed :math:`E_{\\theta^-}(o_t)`, no gradient, where needed.
-        target_next_latent: ``(*batch, p)`` delayed :math:`E_{\\theta^-}(o_{t+1})`, no gradient, where needed.
-        action: ``(*batch, action_dim)`` in physical units, where needed.
-        region: ``(*batch, 1)`` int64 region codes, where needed.
+        latent: ``(*batch, p)`` online latent :math:`E_\theta(o_t)`.
+        next_latent: ``(*batch, p)`` online :math:`E_\theta(o_{t+1})`.
+        target_latent: ``(*batch, p)`` delayed :math:`E_{\theta^-}(o_t)`, no gradient.
+        target_next_latent: ``(*batch, p)`` delayed :math:`E_{\theta^-}(o_{t+1})`, no gradient.
+        action: ``(*batch, action_dim)`` in physical units.
+        region: ``(*batch, 1)`` int64 region codes.
         user_action: ``(*batch, action_dim)`` action of the user's policy, or ``None`` for zero.
         valid: ``(*batch, 1)`` bool, rows that count, or ``None`` for all.
         weights: ``(*batch, 1)`` priority weights, or ``None``.
@@ -57,13 +59,8 @@ class LatentBatch:
         return self.latent.shape[:-1]
 
 
-def next_key(key: NestedKey) -> NestedKey:
-    """The key of the same entry one step later.
-
-    Example:
-        >>> next_key("pixels")
-        ('next', 'pixels')
-    """
+def _next(key: NestedKey) -> NestedKey:
+    """The key of the same entry one step later."""
     return unravel_key(("next", key))
 
 
@@ -72,11 +69,7 @@ def _batch_last(tensor: Tensor, batch: torch.Size) -> Tensor:
     return tensor.unsqueeze(-1) if tensor.shape == batch else tensor
 
 
-Leaf = tuple[dict[str, Any], str, Tensor]
-_LEAVES: WeakKeyDictionary[LossModule, dict[str, list[Leaf]]] = WeakKeyDictionary()
-
-
-def _leaves(loss: LossModule, name: str, network: nn.Module) -> list[Leaf]:
+def _leaves(loss: LossModule, name: str, network: nn.Module) -> list[_Leaf]:
     """Where a network keeps its parameters and buffers, and what the loss has for them: mostly the very same."""
     known = _LEAVES.get(loss)
     if known is None or "_cache_leaves" not in loss.__dict__:  # TorchRL forgets what begins so when a loss is cast
@@ -155,36 +148,28 @@ class LatentLoss(LossModule):
         reduction: ``"none"``, ``"mean"`` or ``"sum"``; ``None`` is ``"mean"``.
 
     Raises:
-        ConfigError: if an option is not valid.
+        ConfigError: if an option is not valid; of a batch, if it lacks an entry.
+        ShapeError: if action or region of a batch have the wrong shape.
+        DTypeError: if the region codes of a batch are not int64.
     """
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that can be changed with ``set_keys``.
+        """Keys that can be changed with ``set_keys``."""
 
-        Attributes:
-            observation: observation that the encoder reads.
-            frames: three successive frames, read in place of two observations where present.
-            latent: latent, read where there is no encoder.
-            action: action in physical units.
-            region: region code, 0 unlabelled, 1 safe, 2 unsafe.
-            user_action: action of the user's policy, in physical units.
-            priority_weight: weights of prioritised sampling.
-            residual: error of the dynamics to add to predicted successors, read where present.
-        """
-
-        observation: NestedKey = "pixels"
-        frames: NestedKey = "frames"
-        latent: NestedKey = "latent"
-        action: NestedKey = "action"
-        region: NestedKey = "region"
-        user_action: NestedKey = "user_action"
-        priority_weight: NestedKey = "priority_weight"
-        residual: NestedKey = "residual"
+        observation: NestedKey = "pixels"  # read by the encoder
+        frames: NestedKey = "frames"  # three in succession, read in place of two observations where present
+        latent: NestedKey = "latent"  # read where there is no encoder
+        action: NestedKey = "action"  # in physical units
+        region: NestedKey = "region"  # code: 0 unlabelled, 1 safe, 2 unsafe
+        user_action: NestedKey = "user_action"  # of the user's policy, in physical units
+        priority_weight: NestedKey = "priority_weight"  # of prioritised sampling
+        residual: NestedKey = "residual"  # error to add to predicted successors, read where present
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
     _schedulable_buffers = frozenset({"safety_margin", "dynamics_margin"})
+    _reads: tuple[str, ...] = ()  # further keys
 
     encoder: TensorDictModuleBase | None
     encoder_params: TensorDictParams
@@ -198,8 +183,10 @@ class LatentLoss(LossModule):
     actor_network: TensorDictModuleBase
     actor_network_params: TensorDictParams
     target_actor_network_params: TensorDictParams
-    safety_margin: Tensor
-    dynamics_margin: Tensor
+
+    if TYPE_CHECKING:  # coefficients are buffers
+
+        def __getattr__(self, name: str) -> Any: ...
 
     def __init__(
         self,
@@ -218,8 +205,7 @@ class LatentLoss(LossModule):
     ) -> None:
         if unknown:
             raise ConfigError(
-                f"expected options of {type(self).__name__} among {self.options()}, "
-                f"received {sorted(unknown)}"
+                f"expected options of {type(self).__name__} among {self.options()}, received {sorted(unknown)}"
             )
         super().__init__()
         self.register_load_state_dict_post_hook(_forget)
@@ -229,21 +215,17 @@ class LatentLoss(LossModule):
         self._active: set[str] = set()
         self.out_keys: list[str] = []
         self.reduction = "mean" if reduction is None else reduction
-        if self.reduction not in REDUCTIONS:
-            raise ConfigError(f"expected reduction to be one of {REDUCTIONS}, received {reduction!r}")
+        if self.reduction not in _REDUCTIONS:
+            raise ConfigError(f"expected reduction to be one of {_REDUCTIONS}, received {reduction!r}")
         if not 0.0 < worst_fraction <= 1.0:
-            raise ConfigError(
-                f"expected worst_fraction in (0, 1], received {worst_fraction}; for instance 0.05"
-            )
-        self._coefficients(
-            safety_margin=safety_margin, dynamics_margin=dynamics_margin, worst_coeff=worst_coeff
-        )
+            raise ConfigError(f"expected worst_fraction in (0, 1], received {worst_fraction}; for instance 0.05")
+        self._coefficients(safety_margin=safety_margin, dynamics_margin=dynamics_margin, worst_coeff=worst_coeff)
         self.worst_fraction = float(worst_fraction)
         scales = [getattr(getattr(m, "module", m), "action_scale", None) for m in (dynamics, policy)]
         if all(isinstance(s, Tensor) for s in scales) and not torch.equal(*scales):  # type: ignore[arg-type]
             raise ConfigError(
-                f"expected one action_scale in dynamics and policy, received {scales[0].tolist()} and "  # type: ignore[union-attr]
-                f"{scales[1].tolist()}; give both the largest action in physical units"  # type: ignore[union-attr]
+                "expected one action_scale in dynamics and policy, received {} and {}; give both the largest action in "
+                "physical units".format(*(s.tolist() for s in scales))  # type: ignore[union-attr]
             )
         keys = self.tensor_keys
         if encoder is not None:
@@ -252,23 +234,16 @@ class LatentLoss(LossModule):
         else:
             self.encoder = None
         if dynamics is not None:
-            self._add("dynamics", dynamics, [keys.latent, keys.action], [next_key(keys.latent)], delayed)
+            self._add("dynamics", dynamics, [keys.latent, keys.action], [_next(keys.latent)], delayed)
         if barrier is not None:
             self._add("barrier", barrier, [keys.latent], ["barrier"], delayed)
         if policy is not None:
             # TorchRL's trainers and weight synchronisation look for this name.
             self._add("actor_network", policy, [keys.latent], [keys.action], delayed)
 
-    # ------------------------------------------------------------------ construction
-
     @classmethod
     def options(cls) -> list[str]:
-        """Names of all keyword options of the loss, those of its bases included.
-
-        Example:
-            >>> "safety_margin" in LatentLoss.options()
-            True
-        """
+        """Names of all keyword options of the loss, those of its bases included."""
         names: set[str] = set()
         for base in cls.__mro__:
             if issubclass(base, LatentLoss) and "__init__" in base.__dict__:
@@ -277,11 +252,7 @@ class LatentLoss(LossModule):
 
     def _coefficients(self, **values: float) -> None:
         for name, value in values.items():
-            if (
-                isinstance(value, bool)
-                or not isinstance(value, (int, float))
-                or not 0.0 <= value < float("inf")
-            ):
+            if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0.0 <= value < float("inf"):
                 raise ConfigError(f"expected {name} to be a finite number >= 0, received {value!r}")
             self.register_coeff_buffer(name, float(value))
             if value > 0.0:
@@ -295,40 +266,29 @@ class LatentLoss(LossModule):
         self.register_buffer("action_scale", scale, persistent=False)
 
     def _add(
-        self,
-        name: str,
-        module: nn.Module,
-        in_keys: list[NestedKey],
-        out_keys: list[NestedKey],
-        delayed: Iterable[str] = (),
+        self, name: str, module: nn.Module, reads: list[NestedKey], writes: list[NestedKey], delayed: Iterable[str] = ()
     ) -> None:
-        network = as_tensordict_module(module, in_keys, out_keys)
+        network = as_tensordict_module(module, reads, writes)
         self.convert_to_functional(network, name, create_target_params=name in set(delayed))
         self._networks_used.append(name)
 
     def _forward_value_estimator_keys(self, **kwargs: object) -> None:
         self._in_keys = None
 
-    # ------------------------------------------------------------------ keys
-
     def _set_in_keys(self) -> None:
         keys = self.tensor_keys
         source = keys.latent if self.encoder is None else keys.observation
-        self._in_keys = [source]
-        if "action" in self._needs:
-            self._in_keys.append(keys.action)
-        if "region" in self._needs:
-            self._in_keys.append(keys.region)
-        if {"next_latent", "target_next_latent"} & self._needs:
-            self._in_keys.append(next_key(source))
-        if self.encoder is not None:
-            self._in_keys.append(keys.frames)
-        if "user_action" in self._needs:
-            self._in_keys.append(keys.user_action)
-        if "residual" in self._needs:
-            self._in_keys.append(keys.residual)
-        if self.use_prioritized_weights:
-            self._in_keys.append(keys.priority_weight)
+        wanted = [
+            (source, True),
+            (keys.action, "action" in self._needs),
+            (keys.region, "region" in self._needs),
+            (_next(source), {"next_latent", "target_next_latent"} & self._needs),
+            (keys.frames, self.encoder is not None),
+            (keys.user_action, "user_action" in self._needs),
+            (keys.residual, "residual" in self._needs),
+            (keys.priority_weight, self.use_prioritized_weights),
+        ]
+        self._in_keys = [key for key, read in wanted if read] + [getattr(keys, name) for name in self._reads]
 
     @property
     def in_keys(self) -> list[NestedKey]:  # type: ignore[override]
@@ -343,23 +303,13 @@ class LatentLoss(LossModule):
         self._in_keys = keys
 
     def select_out_keys(self, *out_keys: NestedKey) -> LatentLoss:
-        """Restricts the output to some of its entries.
-
-        Example:
-            >>> from torchrl_sspl.modules import Policy
-            >>> from torchrl_sspl.objectives import PolicyDeviationLoss
-            >>> loss = PolicyDeviationLoss(None, Policy(2, 1)).select_out_keys("loss_policy_deviation")
-            >>> loss.out_keys
-            ['loss_policy_deviation']
-        """
+        """Restricts the output to some of its entries."""
         unknown = set(out_keys) - set(self.out_keys_source)
         if unknown:
             raise ConfigError(f"expected keys among {list(self.out_keys_source)}, received {sorted(unknown)}")
         # TensorDict's own selection takes a batch without optional entries for a keyword call, and fails.
         self._out_keys_apparent = list(out_keys)
         return self
-
-    # ------------------------------------------------------------------ networks
 
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
@@ -390,8 +340,6 @@ class LatentLoss(LossModule):
             return _called(network, inputs, method, self.tensor_keys.action)
         finally:
             swapped.to_module(network, preserve_module_state=False, return_swap=False)
-
-    # ------------------------------------------------------------------ input
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, field: str) -> Tensor:
         value = tensordict.get(key, None)
@@ -427,7 +375,7 @@ class LatentLoss(LossModule):
             if frames is not None:
                 used = frames.narrow(-4, 0 if now else 1, 3 if now and after else 2)
                 return list(self._run("encoder", used, params=params, method="sequence").unbind(-2))
-        wanted = [key] * now + [next_key(key)] * after
+        wanted = [key] * now + [_next(key)] * after
         observed = [_clean(self._get(tensordict, key, field), valid) for key in wanted]
         if self.encoder is None:
             return observed if params == "online" else [latent.detach() for latent in observed]
@@ -478,38 +426,16 @@ class LatentLoss(LossModule):
 
     @torch.no_grad()
     def latents(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
-        """Online latents of a batch of transitions, without gradient.
-
-        Args:
-            tensordict: batch with observations (or frames, or latents) of two successive steps.
-
-        Returns:
-            Latent and next latent, each ``(*batch, p)``.
-
-        Raises:
-            ConfigError: if an entry is missing.
-        """
+        """Online latents ``(*batch, p)`` of the two steps of a batch of transitions, without gradient."""
         now, after = self._encode(tensordict, None, True, True, "online")
         return now, after
 
     @torch.no_grad()
     def predict(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Next latent by the online dynamics, without gradient.
-
-        Args:
-            latent: ``(*batch, p)``.
-            action: ``(*batch, action_dim)`` in physical units.
-
-        Returns:
-            ``(*batch, p)``.
-        """
+        """Next latent ``(*batch, p)`` by the online dynamics, of an action in physical units, without gradient."""
         return self._run("dynamics", latent, action)
 
-    # ------------------------------------------------------------------ output
-
-    def _reduce(
-        self, value: Tensor, batch: LatentBatch, mask: Tensor | None = None, *, worst: bool = False
-    ) -> Tensor:
+    def _reduce(self, value: Tensor, batch: LatentBatch, mask: Tensor | None = None, *, worst: bool = False) -> Tensor:
         """Reduces ``(*batch, 1)``; ``mask`` picks rows, ``worst`` adds the mean over the worst of them."""
         if batch.valid is not None:
             mask = batch.valid if mask is None else mask & batch.valid

@@ -20,33 +20,22 @@ class ConsistencyLoss(LatentLoss):
 
     .. math:: L = \operatorname{mean}_D\, w \| z_{t+1} - d(z_t, u_t) \|^2, \qquad w = w_U \text{ on } U, \text{ else } 1
 
+    Output: ``loss_consistency`` and the detached metrics ``dynamics_error`` and ``dynamics_error_max`` (2-norms).
+    Source: paper eq. (8), third term, with the encoder frozen; deviation: the weight of U, and the worst rows.
+
     Args:
         dynamics: (latent, action) -> next latent ``(*batch, p)``.
         unsafe_weight: :math:`w_U`, weight of transitions that start in U.
-        **shared: ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`.
-
-    Returns:
-        ``forward`` returns ``loss_consistency`` and the detached metrics ``dynamics_error`` and ``dynamics_error_max``
-        (2-norms).
-
-    Raises:
-        ConfigError: if an option is not valid, or an entry of the batch is missing.
-        ShapeError: if action or region have the wrong shape.
-        DTypeError: if the region codes are not int64.
-
-    Source: paper eq. (8), third term, with the encoder frozen; deviation: the weight of U, and the worst rows.
+        **shared: ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`, for errors too.
 
     Example:
         >>> from torchrl_sspl.modules import LatentDynamics
-        >>> loss = ConsistencyLoss(LatentDynamics(2, 1))
         >>> following = TensorDict(latent=torch.zeros(4, 2), batch_size=4)
         >>> data = TensorDict(latent=torch.zeros(4, 2), action=torch.zeros(4, 1),
         ...                   region=torch.zeros(4, 1, dtype=torch.int64), next=following, batch_size=4)
-        >>> sorted(loss(data).keys())
+        >>> sorted(ConsistencyLoss(LatentDynamics(2, 1))(data).keys())
         ['dynamics_error', 'dynamics_error_max', 'loss_consistency']
     """
-
-    unsafe_weight: Tensor
 
     def __init__(self, dynamics: nn.Module, *, unsafe_weight: float = 1.0, **shared: Any) -> None:
         if not unsafe_weight > 0:

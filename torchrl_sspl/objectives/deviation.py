@@ -19,29 +19,21 @@ class PolicyDeviationLoss(LatentLoss):
 
     .. math:: L_\pi = \operatorname{mean}_{D} \| \pi(z) - \pi_{user}(o) \|_2
 
+    Output: ``loss_policy_deviation``. Source: paper eq. (13).
+
     Args:
         encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"``.
         policy: latent -> action ``(*batch, action_dim)`` in physical units.
-        user_policy: ``None`` for the zero action (the paper's pendulum), ``"data"`` to read
-            ``"user_action"`` from the batch, or a module that is run without gradient: a TensorDict
-            module on the batch, a plain network on the observation (on the latent without encoder). It
-            stays outside the parameters of the loss.
+        user_policy: ``None`` for the zero action (the paper's pendulum), ``"data"`` to read ``"user_action"`` from the
+            batch, or a module that is run without gradient and stays outside the parameters of the loss: a TensorDict
+            module on the batch, a plain network on the observation (on the latent without encoder).
         detach: ``("encoder",)`` keeps the gradient of this loss out of the encoder.
-        **shared: ``reduction``; see :class:`LatentLoss`.
-
-    Returns:
-        ``forward`` returns a tensordict with ``loss_policy_deviation``.
-
-    Raises:
-        ConfigError: if ``user_policy`` is none of the above, or an entry of the batch is missing.
-
-    Source: paper eq. (13).
+        **shared: ``reduction``; see :class:`LatentLoss`, for errors too.
 
     Example:
         >>> from torchrl_sspl.modules import Policy
-        >>> loss = PolicyDeviationLoss(None, Policy(2, 1), user_policy="data")
         >>> data = TensorDict(latent=torch.zeros(4, 2), user_action=torch.zeros(4, 1), batch_size=4)
-        >>> loss(data)["loss_policy_deviation"].shape
+        >>> PolicyDeviationLoss(None, Policy(2, 1), user_policy="data")(data)["loss_policy_deviation"].shape
         torch.Size([])
     """
 
@@ -90,17 +82,5 @@ class PolicyDeviationLoss(LatentLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss on a batch of observations or latents.
-
-        Args:
-            tensordict: batch with observation (or frames, or latents); not changed.
-
-        Returns:
-            ``loss_policy_deviation``.
-
-        Raises:
-            ConfigError: if an entry is missing.
-
-        Source: paper eq. (13).
-        """
+        """The loss on a batch of observations (or frames, or latents); the batch is not changed."""
         return self._pack(self._deviation_terms(self._read(tensordict)), tensordict)

@@ -21,7 +21,8 @@ class LipschitzLoss(LatentLoss):
     It reads no data. Its step is apart from that of the other losses (paper, Algorithm 1), and a plain optimiser
     step may leave the cone: follow it by ``barrier.backtracking_step``. The default
     :class:`~torchrl_sspl.lipschitz.SandwichBarrier` satisfies the matrix inequality by construction and needs no
-    such loss.
+    such loss. Output: ``loss_lipschitz`` and the detached metric ``eigenvalue_min`` of M.
+    Source: paper eq. (9); deviation: outside the cone, where the printed loss goes on, it raises.
 
     Args:
         barrier: an :class:`~torchrl_sspl.lipschitz.LMIBarrier`, or a network with a differentiable method
@@ -29,24 +30,17 @@ class LipschitzLoss(LatentLoss):
         lipschitz_coeff: weight of the loss.
         **shared: see :class:`LatentLoss`; the reduction plays no part, :math:`L_M` is one number.
 
-    Returns:
-        ``forward`` returns a tensordict with ``loss_lipschitz`` and the detached metric ``eigenvalue_min`` of M.
-
     Raises:
         ConfigError: if the barrier has no method ``matrix``.
         NotPositiveDefiniteError: in ``forward``, if M is not positive definite (NaN when compiled).
 
-    Source: paper eq. (9); deviation: outside the cone, where the printed loss goes on, it raises.
-
     Example:
         >>> from torchrl_sspl.lipschitz import LMIBarrier
         >>> _ = torch.manual_seed(0)
-        >>> loss = LipschitzLoss(LMIBarrier(2, (8,), lipschitz_bound=2.0))
-        >>> loss()[1] > 0
+        >>> LipschitzLoss(LMIBarrier(2, (8,), lipschitz_bound=2.0))()[1] > 0
         tensor(True)
     """
 
-    lipschitz_coeff: torch.Tensor
     _schedulable_buffers = frozenset({"lipschitz_coeff"})
 
     def __init__(self, barrier: nn.Module, *, lipschitz_coeff: float = 1.0, **shared: Any) -> None:
@@ -65,19 +59,7 @@ class LipschitzLoss(LatentLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss; the batch is not read.
-
-        Args:
-            tensordict: ignored, may be left out.
-
-        Returns:
-            ``loss_lipschitz`` and ``eigenvalue_min``.
-
-        Raises:
-            NotPositiveDefiniteError: if M is not positive definite.
-
-        Source: paper eq. (9).
-        """
+        """The loss; the batch is not read and may be left out."""
         matrix = self._run("barrier", method="matrix")
         factor, info = torch.linalg.cholesky_ex(matrix)
         # Reading the flag would break the graph of a compiled loss; there the value becomes NaN.

@@ -34,66 +34,41 @@ class SaLaDLoss(LatentLoss):
         L_{SaLaD} = \xi_1 \operatorname{mean}_{S} \max(0, B(z) + \psi) + \xi_2 \operatorname{mean}_{U}
         \max(0, -B(z) + \psi) + \xi_3 \operatorname{mean}_{D} \| \bar z_{t+1} - d(z_t, u_t) \|^2
 
-    with :math:`z_t = E_\theta(o_t)` and :math:`\bar z_{t+1}` the delayed
-    :math:`E_{\theta^-}(o_{t+1})`, or with ``consistency="online"`` the latent of the same encoder with
-    gradient through both branches. D is every row of the batch; S and U are the rows with region code
-    1 and 2.
-
-    Extra terms, all off by default:
+    with :math:`z_t = E_\theta(o_t)` and :math:`\bar z_{t+1}` the delayed :math:`E_{\theta^-}(o_{t+1})`, or with
+    ``consistency="online"`` the latent of the same encoder with gradient through both branches. D is every row of the
+    batch; S and U are the rows with region code 1 and 2. Extra terms, all off by default:
 
     * ``inverse_dynamics_coeff``: :math:`\| \hat u(z_t, z_{t+1}) - u_t \|^2` in units of the largest
       action, from encoded latents: the latent keeps what the action changes;
-    * ``variance_coeff``: :math:`\operatorname{mean}_j \max(0, \sigma_0 - \operatorname{std} z_j)`,
-      against collapse;
-    * ``covariance_coeff``: :math:`\tfrac1p \sum_{i \ne j} \operatorname{cov}(z_i, z_j)^2`, against
-      redundancy;
+    * ``variance_coeff``: :math:`\operatorname{mean}_j \max(0, \sigma_0 - \operatorname{std} z_j)`, against collapse;
+    * ``covariance_coeff``: :math:`\tfrac1p \sum_{i \ne j} \operatorname{cov}(z_i, z_j)^2`, against redundancy;
     * ``saturation_coeff``: :math:`\max(0, \operatorname{artanh}|z_j| - \operatorname{artanh} z_0)^2`,
       against latents that stick to the walls of :math:`[-1, 1]^p`;
     * ``worst_coeff``: adds the mean over the worst ``worst_fraction`` of the rows to the three terms above.
 
-    Args:
-        encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"`` and
-            ``("next", "latent")``.
-        dynamics: (latent, action) -> next latent ``(*batch, p)``.
-        barrier: latent -> barrier value ``(*batch, 1)``, at most zero means safe.
-        safe_coeff: :math:`\xi_1`.
-        unsafe_coeff: :math:`\xi_2`.
-        consistency_coeff: :math:`\xi_3`.
-        consistency: ``"target"`` (delayed encoder, paper) or ``"online"``.
-        inverse_dynamics_coeff: weight of the inverse dynamics.
-        inverse_dynamics: (latent, next latent) -> action; built from the sizes of the dynamics if not given.
-        variance_coeff: weight of the variance term.
-        variance_floor: standard deviation :math:`\sigma_0` that every latent dimension should reach.
-        covariance_coeff: weight of the covariance term.
-        saturation_coeff: weight of the saturation term.
-        saturation_limit: size :math:`z_0` of a latent coordinate from which it counts as saturated.
-        **shared: ``safety_margin`` :math:`\psi`, ``worst_coeff``, ``worst_fraction``, ``reduction``; see
-            :class:`LatentLoss`.
-
-    Returns:
-        ``forward`` returns a tensordict with ``loss_safe``, ``loss_unsafe``, ``loss_consistency`` and one
-        ``loss_<term>`` per active extra term, all weighted; and the detached metrics ``dynamics_error`` and
-        ``dynamics_error_max`` (2-norms), ``safe_error`` and ``unsafe_error`` (shares of S and U on the
-        wrong side of zero), ``latent_std`` (of the narrowest dimension).
-
-    Raises:
-        ConfigError: if an option is not valid, or an entry of the batch is missing.
-        ShapeError: if action or region have the wrong shape.
-        DTypeError: if the region codes are not int64.
-
+    Output: ``loss_safe``, ``loss_unsafe``, ``loss_consistency`` and one ``loss_<term>`` per active extra term, all
+    weighted; and the detached metrics ``dynamics_error`` and ``dynamics_error_max`` (2-norms), ``safe_error`` and
+    ``unsafe_error`` (shares of S and U on the wrong side of zero), ``latent_std`` (of the narrowest dimension).
     Source: paper eq. (8); means over the batch in place of sums over the data (``reduction="sum"`` for sums).
 
+    Args:
+        encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold latents.
+        dynamics: (latent, action) -> next latent ``(*batch, p)``.
+        barrier: latent -> barrier value ``(*batch, 1)``, at most zero means safe.
+        safe_coeff, unsafe_coeff, consistency_coeff: :math:`\xi_1, \xi_2, \xi_3`.
+        consistency: ``"target"`` (delayed encoder, paper) or ``"online"``.
+        inverse_dynamics_coeff, variance_coeff, covariance_coeff, saturation_coeff: weights of the extra terms.
+        inverse_dynamics: (latent, next latent) -> action; built from the sizes of the dynamics if not given.
+        variance_floor: standard deviation :math:`\sigma_0` that every latent dimension should reach.
+        saturation_limit: size :math:`z_0` of a latent coordinate from which it counts as saturated.
+        **shared: ``safety_margin`` :math:`\psi`, ``worst_coeff``, ``worst_fraction``, ``reduction``; see
+            :class:`LatentLoss`, for errors too.
+
     Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_sspl.modules import LatentDynamics
-        >>> _ = torch.manual_seed(0)
-        >>> loss = SaLaDLoss(nn.Sequential(nn.Linear(3, 2), nn.Tanh()), LatentDynamics(2, 1), nn.Linear(2, 1),
-        ...                  consistency="online")
-        >>> _ = loss.set_keys(observation="observation")
-        >>> data = TensorDict(observation=torch.randn(8, 3), action=torch.randn(8, 1),
-        ...                   region=torch.tensor([0, 0, 0, 0, 1, 1, 2, 2])[:, None],
-        ...                   next=TensorDict(observation=torch.randn(8, 3), batch_size=8), batch_size=8)
+        >>> loss = SaLaDLoss(None, LatentDynamics(2, 1), nn.Linear(2, 1), consistency="online")
+        >>> data = TensorDict(latent=torch.rand(3, 2), action=torch.zeros(3, 1), region=torch.tensor([[0], [1], [2]]),
+        ...                   next=TensorDict(latent=torch.rand(3, 2), batch_size=3), batch_size=3)
         >>> sorted(key for key in loss(data).keys() if key.startswith("loss_"))
         ['loss_consistency', 'loss_safe', 'loss_unsafe']
     """
@@ -101,16 +76,7 @@ class SaLaDLoss(LatentLoss):
     inverse_dynamics: TensorDictModuleBase
     inverse_dynamics_params: TensorDictParams
     target_inverse_dynamics_params: TensorDictParams
-    safe_coeff: Tensor
-    unsafe_coeff: Tensor
-    consistency_coeff: Tensor
-    inverse_dynamics_coeff: Tensor
-    variance_coeff: Tensor
-    covariance_coeff: Tensor
-    saturation_coeff: Tensor
-    _schedulable_buffers = frozenset(
-        {"safe_coeff", "unsafe_coeff", "consistency_coeff", "inverse_dynamics_coeff"}
-    )
+    _schedulable_buffers = frozenset({"safe_coeff", "unsafe_coeff", "consistency_coeff", "inverse_dynamics_coeff"})
 
     def __init__(
         self,
@@ -135,9 +101,7 @@ class SaLaDLoss(LatentLoss):
         if consistency not in CONSISTENCY:
             raise ConfigError(f"expected consistency to be one of {CONSISTENCY}, received {consistency!r}")
         if not 0.0 < saturation_limit < 1.0:
-            raise ConfigError(
-                f"expected saturation_limit in (0, 1), received {saturation_limit}; for instance 0.9"
-            )
+            raise ConfigError(f"expected saturation_limit in (0, 1), received {saturation_limit}; for instance 0.9")
         if consistency == "target":
             delayed = (*delayed, "encoder")
         super().__init__(encoder=encoder, dynamics=dynamics, barrier=barrier, delayed=delayed, **shared)
@@ -153,11 +117,7 @@ class SaLaDLoss(LatentLoss):
         self.consistency = consistency
         self.variance_floor = float(variance_floor)
         self.saturation_limit = float(saturation_limit)
-        self._needs |= {
-            "action",
-            "region",
-            "target_next_latent" if consistency == "target" else "next_latent",
-        }
+        self._needs |= {"action", "region", "target_next_latent" if consistency == "target" else "next_latent"}
         if "inverse_dynamics_coeff" in self._active:
             self._needs.add("next_latent")
             self._add_inverse_dynamics(inverse_dynamics)
@@ -215,9 +175,7 @@ class SaLaDLoss(LatentLoss):
         if "saturation_coeff" in self._active:
             # 1e-6: largest latent whose inverse tanh is finite in float32.
             depth = batch.latent.abs().clamp_max(1.0 - 1e-6).atanh()
-            limit = torch.atanh(
-                torch.as_tensor(self.saturation_limit, dtype=depth.dtype, device=depth.device)
-            )
+            limit = torch.atanh(torch.as_tensor(self.saturation_limit, dtype=depth.dtype, device=depth.device))
             excess = (depth - limit).clamp_min(0.0).square().mean(-1, keepdim=True)
             terms["loss_saturation"] = self.saturation_coeff * self._reduce(excess, batch)
         with torch.no_grad():
@@ -235,19 +193,5 @@ class SaLaDLoss(LatentLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Terms of the loss on a batch of transitions.
-
-        Args:
-            tensordict: batch with observation (or frames, or latents), action and region; not changed.
-
-        Returns:
-            Weighted ``loss_*`` and detached metrics; see the class.
-
-        Raises:
-            ConfigError: if an entry is missing.
-            ShapeError: if action or region have the wrong shape.
-            DTypeError: if the region codes are not int64.
-
-        Source: paper eq. (8).
-        """
+        """Terms of the loss on a batch of transitions; the batch is not changed."""
         return self._pack(self._salad_terms(self._read(tensordict)), tensordict)

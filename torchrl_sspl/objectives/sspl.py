@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Any
 
@@ -15,43 +16,19 @@ from torchrl_sspl.objectives.salad import SaLaDLoss
 from torchrl_sspl.objectives.synthesis import SynthesisLoss
 
 #: Options that a preset sets; whatever is given explicitly wins.
-PRESETS: MappingProxyType[str, MappingProxyType[str, Any]] = MappingProxyType(
-    {
-        "paper": MappingProxyType(
-            {
-                "consistency": "target",
-                "mode": "paper",
-                "successor": "target",
-                "detach": (),
-                "policy_coeff": 1.0,
-                "reduction": "sum",
-            }
-        ),
-        "sound": MappingProxyType(
-            {
-                "safety_margin": 0.3,
-                "safe_coeff": 0.3,
-                "unsafe_coeff": 0.3,
-                "consistency": "online",
-                "consistency_coeff": 2.0,
-                "inverse_dynamics_coeff": 1.0,
-                "variance_coeff": 0.5,
-                "covariance_coeff": 0.5,
-                "saturation_coeff": 0.3,
-                "mode": "R3",
-                "successor": "online",
-                "detach": ("encoder", "dynamics"),
-                "growth_coeff": 0.1,
-                "off_manifold_coeff": 0.1,
-                "descent_coeff": 0.1,
-                "synthesis_coeff": 0.3,
-                "worst_coeff": 0.3,
-                "policy_coeff": 0.0,
-                "reduction": "mean",
-            }
-        ),
-    }
-)
+PRESETS: Mapping[str, Mapping[str, Any]] = MappingProxyType({
+    "paper": MappingProxyType({
+        "consistency": "target", "mode": "paper", "successor": "target", "detach": (), "policy_coeff": 1.0,
+        "reduction": "sum",
+    }),
+    "sound": MappingProxyType({
+        "safety_margin": 0.3, "safe_coeff": 0.3, "unsafe_coeff": 0.3, "consistency": "online", "consistency_coeff": 2.0,
+        "inverse_dynamics_coeff": 1.0, "variance_coeff": 0.5, "covariance_coeff": 0.5, "saturation_coeff": 0.3,
+        "mode": "R3", "successor": "online", "detach": ("encoder", "dynamics"), "growth_coeff": 0.1,
+        "off_manifold_coeff": 0.1, "descent_coeff": 0.1, "synthesis_coeff": 0.3, "worst_coeff": 0.3,
+        "policy_coeff": 0.0, "reduction": "mean",
+    }),
+})  # fmt: skip
 
 
 class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
@@ -59,56 +36,33 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
 
     .. math:: L_{total} = \lambda_1 L_{syn} + \lambda_2 L_{SaLaD} + \lambda_3 L_\pi
 
-    It is a :class:`SaLaDLoss`, a :class:`SynthesisLoss` and a :class:`PolicyDeviationLoss` over the
-    same networks, and takes the options of all three. The Lipschitz term :math:`L_M` is not part of
-    it: it has its own step (:class:`LipschitzLoss`), and the default barrier needs none.
-
-    ``preset`` sets options that were not given:
-
-    * ``"paper"``: the equations as printed, every extra term off, sums over the batch. Needs a target-network
-      updater.
-    * ``"sound"``: consistency through both branches kept from collapse by inverse dynamics and the spread of the
-      latents, a wide and light hinge, invariance as R3 with gradient to barrier and policy only, slow growth, hard
-      mining.
+    It is a :class:`SaLaDLoss`, a :class:`SynthesisLoss` and a :class:`PolicyDeviationLoss` over the same networks, with
+    the options, errors and outputs of all three, the terms weighted by :math:`\lambda` too; the set of keys depends on
+    the options only. The Lipschitz term :math:`L_M` is not part of it: it has its own step (:class:`LipschitzLoss`),
+    and the default barrier needs none. Source: paper, Algorithm 1, with eq. (8), (10) and (13).
 
     Args:
-        encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"`` and
-            ``("next", "latent")``. ``SSPLLoss(*salad, policy)`` unpacks a
-            :class:`~torchrl_sspl.modules.SaLaD`.
+        encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold latents.
+            ``SSPLLoss(*salad, policy)`` unpacks a :class:`~torchrl_sspl.modules.SaLaD`.
         dynamics: (latent, action) -> next latent ``(*batch, p)``.
         barrier: latent -> barrier value ``(*batch, 1)``, at most zero means safe.
         policy: latent -> action ``(*batch, action_dim)`` in physical units.
-        preset: ``"sound"`` or ``"paper"``.
-        synthesis_coeff: :math:`\lambda_1`.
-        salad_coeff: :math:`\lambda_2`.
-        policy_coeff: :math:`\lambda_3`; 0 leaves the term out.
+        preset: sets options that were not given. ``"paper"``: the equations as printed, every extra term off, sums over
+            the batch; needs a target-network updater. ``"sound"``: consistency through both branches kept from collapse
+            by inverse dynamics and the spread of the latents, a wide and light hinge, invariance as R3 with gradient to
+            barrier and policy only, slow growth, hard mining.
+        synthesis_coeff, salad_coeff, policy_coeff: :math:`\lambda_1, \lambda_2, \lambda_3`; a ``policy_coeff`` of 0
+            leaves the term out.
         **options: options of the three losses.
 
-    Returns:
-        ``forward`` returns a tensordict with the terms and metrics of the three losses, the terms weighted by
-        :math:`\lambda` too. The set of keys depends on the options only.
-
-    Raises:
-        ConfigError: if an option is unknown or not valid, or an entry of the batch is missing.
-        ShapeError: if action or region have the wrong shape.
-        DTypeError: if the region codes are not int64.
-
-    Source: paper, Algorithm 1, with eq. (8), (10) and (13).
-
     Example:
-        >>> import torch
         >>> from torchrl_sspl.modules import LatentDynamics, Policy
-        >>> _ = torch.manual_seed(0)
         >>> loss = SSPLLoss(None, LatentDynamics(2, 1), nn.Linear(2, 1), Policy(2, 1), preset="sound")
-        >>> data = TensorDict(latent=torch.rand(8, 2), action=torch.randn(8, 1),
-        ...                   region=torch.tensor([0, 0, 0, 0, 1, 1, 2, 2])[:, None],
-        ...                   next=TensorDict(latent=torch.rand(8, 2), batch_size=8), batch_size=8)
+        >>> data = TensorDict(latent=torch.rand(3, 2), action=torch.zeros(3, 1), region=torch.tensor([[0], [1], [2]]),
+        ...                   next=TensorDict(latent=torch.rand(3, 2), batch_size=3), batch_size=3)
         >>> sum(value for key, value in loss(data).items() if key.startswith("loss_")).backward()
     """
 
-    synthesis_coeff: Tensor
-    salad_coeff: Tensor
-    policy_coeff: Tensor
     _schedulable_buffers = frozenset({"synthesis_coeff", "salad_coeff", "policy_coeff"})
 
     def __init__(
@@ -140,41 +94,15 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """All terms on a batch of transitions.
-
-        Args:
-            tensordict: batch with observation (or frames, or latents), action and region; not changed.
-
-        Returns:
-            Weighted ``loss_*`` and detached metrics; see the class.
-
-        Raises:
-            ConfigError: if an entry is missing.
-            ShapeError: if action or region have the wrong shape.
-            DTypeError: if the region codes are not int64.
-
-        Source: paper, Algorithm 1.
-        """
+        """All terms on a batch of transitions; the batch is not changed."""
         batch = self._read(tensordict)
-        parts = [
-            (self.salad_coeff, self._salad_terms(batch)),
-            (self.synthesis_coeff, self._synthesis_terms(batch)),
-        ]
+        parts = [(self.salad_coeff, self._salad_terms(batch)), (self.synthesis_coeff, self._synthesis_terms(batch))]
         if "policy_coeff" in self._active:
             parts.append((self.policy_coeff, self._deviation_terms(batch)))
         return self._weighted(parts, tensordict)
 
     def world_model(self, tensordict: TensorDictBase) -> TensorDict:
-        """The terms of the world model alone, as in a warm start; the others are zero and cost nothing.
-
-        Args:
-            tensordict: batch, as for :meth:`forward`.
-
-        Returns:
-            The keys of :meth:`forward`.
-
-        Source: paper, Algorithm 1 (warm start).
-        """
+        """The keys of :meth:`forward`, all but those of the world model zero, as in the warm start of Algorithm 1."""
         return self._weighted([(self.salad_coeff, self._salad_terms(self._read(tensordict)))], tensordict)
 
     def _weighted(self, parts: list[tuple[Tensor, dict[str, Tensor]]], tensordict: TensorDictBase) -> TensorDict:

@@ -31,10 +31,8 @@ class SynthesisLoss(LatentLoss):
     * ``"R1"``: :math:`B(z^+) + m \le (1 - \alpha) B(z)`;
     * ``"R2"``: :math:`B(z^+) + m \le \max(B(z) - \gamma, -c)`;
     * ``"paper"``: :math:`B(z^+) + \eta - B(z) + \psi \le 0` everywhere, which no barrier on a compact
-      invariant set can meet (look at its minimum).
-
-    The margin :math:`\psi` of sampling enters in mode ``"paper"`` only; the other conditions are meant
-    to be verified over the whole latent domain.
+      invariant set can meet (look at its minimum). Only here the margin :math:`\psi` of sampling enters; the other
+      conditions are meant to be verified over the whole latent domain.
 
     Extra terms, all off by default:
 
@@ -48,7 +46,10 @@ class SynthesisLoss(LatentLoss):
     * ``worst_coeff``: adds the mean over the worst ``worst_fraction`` of the rows to the synthesis term.
 
     A batch may hold ``"residual"`` ``(*batch, p)``, an observed error of the dynamics that is added to
-    the successor: the condition is then asked of what may really follow.
+    the successor: the condition is then asked of what may really follow. Output: ``loss_synthesis`` and one
+    ``loss_<term>`` per active extra term, weighted; and the detached metrics ``violation_max``, ``violation_share`` (of
+    rows) and ``inside_share`` (of rows with :math:`B \le 0`). Source: paper eq. (10) in mode ``"paper"`` with
+    ``successor="target"`` and ``detach=()``; the other modes are deviations.
 
     Args:
         encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"``.
@@ -60,43 +61,19 @@ class SynthesisLoss(LatentLoss):
             ``"target"`` :math:`B_{\theta^-}(d(E_{\theta^-}(o), \pi(z)))` (paper).
         detach: networks that get no gradient from this loss, any of ``"encoder"`` and ``"dynamics"``.
             With the gradient (paper) the model can learn to predict what pleases the barrier.
-        band: width b of the product hinge in units of the barrier.
-        decay: :math:`\alpha` of R1.
-        decrement: :math:`\gamma` of R2, in units of the barrier.
-        floor: c of R2, in units of the barrier.
-        growth_coeff: weight of the growth term.
-        growth_depth: depth g that growth aims at, in units of the barrier.
-        off_manifold_coeff: weight of the off-manifold term.
-        descent_coeff: weight of the descent term.
-        descent_scale: scale s of the weight of the descent term, in units of the barrier.
+        band, decay, decrement, floor: b, :math:`\alpha`, :math:`\gamma` and c; all but :math:`\alpha` in barrier units.
+        growth_coeff, off_manifold_coeff, descent_coeff: weights of the extra terms.
+        growth_depth, descent_scale: g and s, in units of the barrier.
         **shared: ``safety_margin`` :math:`\psi`, ``dynamics_margin`` :math:`\eta`, ``worst_coeff``,
-            ``worst_fraction``, ``reduction``; see :class:`LatentLoss`.
-
-    Returns:
-        ``forward`` returns a tensordict with ``loss_synthesis`` and one ``loss_<term>`` per active
-        extra term, weighted; and the detached metrics ``violation_max``, ``violation_share`` (of rows)
-        and ``inside_share`` (of rows with :math:`B \le 0`).
-
-    Raises:
-        ConfigError: if an option is not valid, or an entry of the batch is missing.
-
-    Source: paper eq. (10) in mode ``"paper"`` with ``successor="target"`` and ``detach=()``; the other
-    modes are deviations.
+            ``worst_fraction``, ``reduction``; see :class:`LatentLoss`, for errors too.
 
     Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> from torchrl_sspl.modules import LatentDynamics, Policy
-        >>> _ = torch.manual_seed(0)
         >>> loss = SynthesisLoss(None, LatentDynamics(2, 1), nn.Linear(2, 1), Policy(2, 1))
-        >>> out = loss(TensorDict(latent=torch.rand(8, 2), batch_size=8))
-        >>> sorted(out.keys())
+        >>> sorted(loss(TensorDict(latent=torch.rand(8, 2), batch_size=8)).keys())
         ['inside_share', 'loss_synthesis', 'violation_max', 'violation_share']
     """
 
-    growth_coeff: Tensor
-    off_manifold_coeff: Tensor
-    descent_coeff: Tensor
     _schedulable_buffers = frozenset({"growth_coeff", "growth_depth", "off_manifold_coeff", "descent_coeff"})
 
     def __init__(
@@ -126,9 +103,7 @@ class SynthesisLoss(LatentLoss):
         if successor not in SUCCESSORS:
             raise ConfigError(f"expected successor to be one of {SUCCESSORS}, received {successor!r}")
         if isinstance(detach, str) or not set(detach) <= set(DETACHABLE):
-            raise ConfigError(
-                f"expected detach to be a tuple of names among {DETACHABLE}, received {detach!r}"
-            )
+            raise ConfigError(f"expected detach to be a tuple of names among {DETACHABLE}, received {detach!r}")
         if not band > 0.0 or not descent_scale > 0.0:
             raise ConfigError(f"expected band > 0 and descent_scale > 0, received {band} and {descent_scale}")
         if not 0.0 <= decay <= 1.0 or decrement < 0.0 or floor < 0.0:
@@ -138,9 +113,7 @@ class SynthesisLoss(LatentLoss):
             )
         if successor == "target":
             delayed = (*delayed, "encoder", "barrier")
-        super().__init__(
-            encoder=encoder, dynamics=dynamics, barrier=barrier, policy=policy, delayed=delayed, **shared
-        )
+        super().__init__(encoder=encoder, dynamics=dynamics, barrier=barrier, policy=policy, delayed=delayed, **shared)
         self._coefficients(
             growth_coeff=growth_coeff,
             growth_depth=growth_depth,
@@ -148,12 +121,7 @@ class SynthesisLoss(LatentLoss):
             descent_coeff=descent_coeff,
         )
         self.mode, self.successor, self.detach = mode, successor, tuple(detach)
-        self.band, self.decay, self.decrement, self.floor = (
-            float(band),
-            float(decay),
-            float(decrement),
-            float(floor),
-        )
+        self.band, self.decay, self.decrement, self.floor = float(band), float(decay), float(decrement), float(floor)
         self.descent_scale = float(descent_scale)
         self._needs.add("residual")
         if successor == "target":
@@ -190,9 +158,7 @@ class SynthesisLoss(LatentLoss):
             uniform = torch.rand_like(latent) * 2.0 - 1.0
             origin, at = torch.stack([latent, uniform]), torch.stack([start, uniform])
         action = self._run("actor_network", origin)
-        successor = self._run(
-            "dynamics", at, action, params="frozen" if "dynamics" in self.detach else "online"
-        )
+        successor = self._run("dynamics", at, action, params="frozen" if "dynamics" in self.detach else "online")
         if batch.residual is not None:
             # Uniform latents have no observed error.
             error = batch.residual
@@ -207,9 +173,7 @@ class SynthesisLoss(LatentLoss):
         violation = self._violation(barrier, barrier_next)
         terms = {}
         if stray:
-            terms["loss_off_manifold"] = self.off_manifold_coeff * self._reduce(
-                violation[1], batch, worst=True
-            )
+            terms["loss_off_manifold"] = self.off_manifold_coeff * self._reduce(violation[1], batch, worst=True)
             barrier, barrier_next, violation = barrier[0], barrier_next[0], violation[0]
         terms["loss_synthesis"] = self._reduce(violation, batch, worst=True)
         if "growth_coeff" in self._active:
@@ -235,18 +199,5 @@ class SynthesisLoss(LatentLoss):
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """Terms of the loss on a batch of observations or latents.
-
-        Args:
-            tensordict: batch with observation (or frames, or latents), and region if growth is on; not
-                changed.
-
-        Returns:
-            Weighted ``loss_*`` and detached metrics; see the class.
-
-        Raises:
-            ConfigError: if an entry is missing.
-
-        Source: paper eq. (10).
-        """
+        """Terms of the loss on a batch of observations (or frames, or latents); the batch is not changed."""
         return self._pack(self._synthesis_terms(self._read(tensordict)), tensordict)

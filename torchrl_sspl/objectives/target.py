@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from tensordict import NestedKey, TensorDict, TensorDictBase
 from tensordict.nn import dispatch
-from torch import Tensor, nn
+from torch import nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import safe_hinge, unsafe_hinge
@@ -26,7 +26,9 @@ class TargetLoss(LatentLoss):
 
     with :math:`r = B(z) - t` inside the set, :math:`r = \max(0, \min(t, t_{\max}) - B(z))` outside (only the sign
     matters there), and the weight :math:`w(t) = e^{-|t| / s} + 0.1`, largest at the border. Targets come from
-    :mod:`torchrl_sspl.viability.cloud`.
+    :mod:`torchrl_sspl.viability.cloud`. Output: ``loss_target``, ``loss_policy_target``, ``loss_safe``,
+    ``loss_unsafe``, weighted. Source: none; the paper trains barrier and policy on the condition alone, from which no
+    set grows.
 
     Args:
         barrier: latent -> barrier value ``(*batch, 1)``, at most zero means safe.
@@ -35,55 +37,32 @@ class TargetLoss(LatentLoss):
         outside_cap: :math:`t_{\max}`, value beyond which a target outside asks for no more.
         scale: s, in units of the barrier.
         policy_coeff: :math:`\kappa`.
-        safe_coeff: :math:`\xi_1`, on rows with region code 1; 0 leaves the term out.
-        unsafe_coeff: :math:`\xi_2`, on rows with region code 2; 0 leaves the term out.
+        safe_coeff, unsafe_coeff: :math:`\xi_1`, :math:`\xi_2`, on rows with region code 1 and 2; 0 leaves a term out.
         action_scale: :math:`u_{\max}`, largest action in physical units, a number or one per dimension.
         **shared: ``safety_margin`` :math:`\psi`, ``worst_coeff``, ``worst_fraction``, ``reduction``; see
-            :class:`LatentLoss`.
-
-    Returns:
-        ``forward`` returns a tensordict with ``loss_target``, ``loss_policy_target``, ``loss_safe`` and
-        ``loss_unsafe``, weighted.
-
-    Raises:
-        ConfigError: if an option is not valid, or an entry of the batch is missing.
-
-    Source: none; the paper trains barrier and policy on the condition alone, from which no set grows.
+            :class:`LatentLoss`, for errors too.
 
     Example:
         >>> from torchrl_sspl.modules import Policy
-        >>> _ = torch.manual_seed(0)
-        >>> loss = TargetLoss(nn.Linear(2, 1), Policy(2, 1))
-        >>> rows = TensorDict(latent=torch.rand(4, 2), barrier_target=torch.zeros(4, 1), action_target=torch.zeros(4, 1),
-        ...                   inside=torch.ones(4, 1, dtype=torch.bool), action_weight=torch.ones(4, 1),
-        ...                   region=torch.tensor([[0], [0], [1], [2]]), batch_size=4)
-        >>> sorted(loss(rows).keys())
+        >>> one = torch.ones(4, 1)
+        >>> rows = TensorDict(latent=torch.rand(4, 2), barrier_target=one, action_target=one, action_weight=one,
+        ...                   inside=one.bool(), region=torch.tensor([[0], [0], [1], [2]]), batch_size=4)
+        >>> sorted(TargetLoss(nn.Linear(2, 1), Policy(2, 1))(rows).keys())
         ['loss_policy_target', 'loss_safe', 'loss_target', 'loss_unsafe']
     """
 
     @dataclass
     class _AcceptedKeys(LatentLoss._AcceptedKeys):
-        """Keys that can be changed with ``set_keys``.
+        """Keys that can be changed with ``set_keys``."""
 
-        Attributes:
-            barrier_target: ``(*batch, 1)`` target of the barrier.
-            inside: ``(*batch, 1)`` bool, whether the latent belongs to the set.
-            action_target: ``(*batch, action_dim)`` target of the policy, physical units.
-            action_weight: ``(*batch, 1)`` weight of the policy's target (0: none).
-        """
-
-        barrier_target: NestedKey = "barrier_target"
-        inside: NestedKey = "inside"
-        action_target: NestedKey = "action_target"
-        action_weight: NestedKey = "action_weight"
+        barrier_target: NestedKey = "barrier_target"  # (*batch, 1) target of the barrier
+        inside: NestedKey = "inside"  # (*batch, 1) bool, whether the latent belongs to the set
+        action_target: NestedKey = "action_target"  # (*batch, action_dim) target of the policy, physical units
+        action_weight: NestedKey = "action_weight"  # (*batch, 1) weight of the policy's target (0: none)
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    action_scale: Tensor
-    safe_coeff: Tensor
-    unsafe_coeff: Tensor
-    policy_coeff: Tensor
-    inside_coeff: Tensor
+    _reads = ("barrier_target", "inside", "action_target", "action_weight")
 
     def __init__(
         self,
@@ -107,14 +86,8 @@ class TargetLoss(LatentLoss):
         )
         self.outside_cap, self.scale = float(outside_cap), float(scale)
         self._set_action_scale(action_scale)
-        self._needs |= {"region"}
+        self._needs.add("region")
         self.out_keys += ["loss_target", "loss_policy_target", "loss_safe", "loss_unsafe"]
-
-    def _set_in_keys(self) -> None:
-        super()._set_in_keys()
-        keys = self.tensor_keys
-        assert self._in_keys is not None
-        self._in_keys += [keys.barrier_target, keys.inside, keys.action_target, keys.action_weight]
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
