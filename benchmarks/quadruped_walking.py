@@ -13,6 +13,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from torchrl_sspl.envs.quadruped.gait import PERIOD
 from torchrl_sspl.envs.quadruped.kinematics import wrap_angle
 from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
 from torchrl_sspl.envs.quadruped.world import connect
@@ -29,7 +30,7 @@ def tracking(robot: WalkingRobot, start: Snapshot, yaw_rate: float, seconds: flo
         robot.step([1.0, 0.0, yaw_rate])
         headings.append(robot.pose[2])
         speeds.append(float(robot.measured.velocity @ robot.measured.rotation[:, 0]))
-    cycle, settled = round(robot.controller.trot.period / robot.dt), round(1.5 / robot.dt)
+    cycle, settled = round(PERIOD / robot.dt), round(1.5 / robot.dt)
     heading = np.unwrap(headings)
     rates = (heading[cycle:] - heading[:-cycle]) / (cycle * robot.dt)
     averages = np.convolve(speeds, np.ones(cycle) / cycle, "valid")
@@ -108,7 +109,7 @@ def main() -> None:
             simulated += len(rows) * INTERVAL
         report(name, np.concatenate(parts), falls, n)
         print(f"  so far {simulated / (time.process_time() - start):.2f} x real time", flush=True)
-    print(f"quadratic programs: {robot.controller.mpc.solves}, not solved: {robot.controller.failures}")
+    print(f"quadratic programs: {robot.controller.mpc.solves}, not solved: {robot.controller.mpc.failures}")
 
 
 if __name__ == "__main__":

@@ -158,5 +158,5 @@ def test_unsolved_programs_fall_back_for_a_while_and_then_raise():
     robot = WalkingRobot(client, solver=lambda hessian, *_: (np.zeros(len(hessian)), -1))
     with pytest.raises(SolverError):
         walk(robot, 2000)
-    assert robot.controller.failures > 1
+    assert robot.controller.mpc.failures > 1
     client.disconnect()

@@ -8,7 +8,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Requirement:
-    """One row of a table of requirements: a measurement has to be ``sense`` ("<=" or ">=") ``must``, better even ``aim``.
+    """One row of a table of requirements: a measurement has to be ``sense`` ("<=" or ">=") ``must``, better ``aim``.
 
     ``name`` is that of the measurement, ``label`` says to people what it is. Source: none.
 
@@ -48,8 +48,8 @@ class System:
         state_grid: nodes per state coordinate (one number, or one for each) of the evaluation's grid, corners included;
             of a periodic coordinate the last node is the first again.
         kernel_grid: the same of the grid of the true kernel.
-        unsafe_grid: the same of a grid of its own over U, a periodic coordinate without its last node; None: the nodes of
-            ``state_grid`` in U.
+        unsafe_grid: the same of a grid of its own over U, a periodic coordinate without its last node; None: the nodes
+            of ``state_grid`` in U.
         action_direction: direction of a positive action in the plane of the first two coordinates (a torque pushes the
             angular velocity: ``(0, 1)``), for figures; None: along the path.
         notes: what a report has to say about this system.

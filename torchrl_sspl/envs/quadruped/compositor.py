@@ -7,15 +7,14 @@ import math
 import torch
 from torch import Tensor
 
+from torchrl_sspl.envs.base import check_tensor
 from torchrl_sspl.envs.quadruped.camera import CAMERA_HEIGHT, HALF_VIEW, SUPERSAMPLE
 from torchrl_sspl.envs.quadruped.sprites import HEIGHT_UNIT, TEXEL, Sprites, load_sprites
 from torchrl_sspl.envs.quadruped.world import OBSTACLE_COLOUR, OBSTACLE_HEIGHT
-from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
+from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.sets import Region
 
-ROBOT_RADIUS = 0.42
-"""Nothing of the robot is seen farther than this from its base, in m on the ground."""
-
+_ROBOT_RADIUS = 0.42  # m on the ground; nothing of the robot is seen farther from its base
 _REFERENCE_HEIGHT = 0.344  # m; the back of the robot, whose edges say where it is and where it heads
 _AMBIENT = 0.6  # brightness of walls under a light from above
 _WALL_LEVELS = 17
@@ -40,16 +39,11 @@ class TopViewCompositor:
     Args:
         image_size: height and width of the frames, in pixels; at least 32.
         obstacle: what stands on the ground, a set of points (x, y) in m, of dimension 2; None: nothing.
-        sprites: pictures of the robot. Default those of the package.
         half_view: distance from the middle of the frame to its edge, on the ground, in m.
         device: where the frames are drawn.
 
-    Raises:
-        ConfigError: the image size is not valid.
-        ShapeError: the obstacle is not a set in the plane.
-        CheckpointError: the pictures cannot be read.
-
-    Source: paper, Section IV-B (top view, RGB). Deviation: none.
+    Raises ConfigError or ShapeError for another size or obstacle; CheckpointError if the pictures of the robot cannot
+    be read. Source: paper, Section IV-B (top view, RGB); deviation: none.
 
     Example:
         >>> frames = TopViewCompositor()(torch.tensor([[1.0, 0.5, 0.0]]), torch.tensor([0.25]))
@@ -62,7 +56,6 @@ class TopViewCompositor:
         image_size: int = 128,
         *,
         obstacle: Region | None = None,
-        sprites: Sprites | None = None,
         half_view: float = HALF_VIEW,
         device: torch.device | str | None = None,
     ) -> None:
@@ -73,38 +66,25 @@ class TopViewCompositor:
         self.image_size, self.device = image_size, torch.device(device or "cpu")
         size = image_size * SUPERSAMPLE
         self._half, self._sample = size / 2, 2 * half_view / size  # samples, m
-        self._window = min(SUPERSAMPLE * (math.ceil(ROBOT_RADIUS / self._sample / SUPERSAMPLE) * 2 + 2), size)
-        sprites = sprites or load_sprites()
+        self._window = min(SUPERSAMPLE * (math.ceil(_ROBOT_RADIUS / self._sample / SUPERSAMPLE) * 2 + 2), size)
+        sprites = load_sprites()
         self._table, self._table_size = self._robot(sprites)
         self.phases = len(sprites.postures)
         self._ground = self._arena(obstacle, size).to(self.device)
         self._empty = _unpack(_area(self._ground[None])).to(self.device)[0]
 
     def __call__(self, pose: Tensor, phase: Tensor | None = None) -> Tensor:
-        """Draw frames.
+        """Draw uint8 ``(*batch, 3, image_size, image_size)``; outside the view nothing is drawn of a robot.
 
-        Args:
-            pose: ``(*batch, 3)``, x and y in m, heading in rad; floating point.
-            phase: ``(*batch,)`` gait phase, taken modulo 1. Default 0.
-
-        Returns:
-            uint8 ``(*batch, 3, image_size, image_size)``; outside the view nothing is drawn of a robot.
-
-        Raises:
-            ShapeError, DTypeError, NonFiniteError: an argument is not a finite tensor of the expected shape.
+        Poses are ``(*batch, 3)``, x and y in m, heading in rad; phases of the gait ``(*batch,)``, taken modulo 1, None:
+        0. Raises ShapeError, DTypeError or NonFiniteError for other tensors.
         """
-        if not isinstance(pose, Tensor) or not pose.is_floating_point():
-            found = pose.dtype if isinstance(pose, Tensor) else type(pose).__name__
-            raise DTypeError(f"pose: expected a floating-point tensor, received {found}; call .float().")
-        if pose.ndim < 1 or pose.shape[-1] != 3:
-            raise ShapeError(f"pose: expected shape (*batch, 3), received {tuple(pose.shape)}.")
+        check_tensor("pose", pose, 3)
         batch = pose.shape[:-1]
         phase = pose.new_zeros(batch) if phase is None else phase
         if phase.shape != batch:
             raise ShapeError(f"phase: expected shape {tuple(batch)}, one per pose, received {tuple(phase.shape)}.")
-        for name, value in (("pose", pose), ("phase", phase)):
-            if not bool(torch.isfinite(value).all()):
-                raise NonFiniteError(f"{name}: expected finite values, received NaN or infinity; remove them.")
+        check_tensor("phase", phase[..., None], 1)
         flat = pose.detach().reshape(-1, 3).to(self.device)
         index = torch.round(phase.detach().to(self.device).reshape(-1) * self.phases).long().remainder(self.phases)
         size = self.image_size
@@ -121,9 +101,7 @@ class TopViewCompositor:
         # Samples: column i is at x = (i - half) sample, row j at y = (half - 1 - j) sample.
         column = self._half + pose[:, 0] * (scale / self._sample)
         row = self._half - 1 - pose[:, 1] * (scale / self._sample)
-        limit = 2 * self._half - width
-        left = self._corner(column, limit)
-        top = self._corner(row, limit)
+        left, top = self._corner(column), self._corner(row)
         steps = torch.arange(width, device=pose.device)
         columns, rows = left[:, None] + steps, top[:, None] + steps
         right = (columns - column[:, None]) * (self._sample / TEXEL)  # texels from the base
@@ -145,10 +123,10 @@ class TopViewCompositor:
         which = torch.arange(n, device=pose.device)[:, None, None]
         frames.permute(0, 2, 3, 1)[which, y[:, :, None], x[:, None, :]] = colours.permute(0, 2, 3, 1)
 
-    def _corner(self, middle: Tensor, limit: float) -> Tensor:
+    def _corner(self, middle: Tensor) -> Tensor:
         """First sample of the windows, on a border between pixels and within the frame."""
         first = torch.floor((middle - self._window / 2) / SUPERSAMPLE + 0.5) * SUPERSAMPLE
-        return first.clamp(0, limit).long()
+        return first.clamp(0, 2 * self._half - self._window).long()
 
     def _robot(self, sprites: Sprites) -> tuple[Tensor, int]:
         """Packed colours of the pictures with a rim of nothing, flat, and the size of one picture."""
@@ -187,6 +165,3 @@ def _area(samples: Tensor) -> Tensor:
 def _unpack(total: Tensor) -> Tensor:
     """Colours uint8 ``(n, 3, h, w)`` of packed sums of four samples."""
     return torch.stack([(total >> (shift + 2)) & 255 for shift in (0, 10, 20)], dim=1).to(torch.uint8)
-
-
-__all__ = ["ROBOT_RADIUS", "TopViewCompositor"]

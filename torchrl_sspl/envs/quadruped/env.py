@@ -22,8 +22,8 @@ _RENDER_SIZE = 512
 class QuadrupedEnv(gymnasium.Env):
     r"""A Unitree A1 that walks at constant speed and is told its yaw rate; seen from above in two frames.
 
-    The robot is simulated with its convex MPC in PyBullet; feet and body collide with the obstacle. An episode ends when
-    the robot falls or leaves the arena, which counts as safe. Every entry of ``info`` is about the present step:
+    The robot is simulated with its convex MPC in PyBullet; feet and body collide with the obstacle. An episode ends
+    when the robot falls or leaves the arena, which counts as safe. Every entry of ``info`` is about the present step:
 
     ============= ===========================================================================================
     ``pose``      (x, y, heading) of the base [m, m, rad], float64 ``(3,)``
@@ -44,17 +44,15 @@ class QuadrupedEnv(gymnasium.Env):
         safe_half_size: S lies outside the square of this half edge around the obstacle, m.
         unsafe_half_size: half edge, or radius, of U around the obstacle, m.
         obstacle_shape: "square" or "disc".
-        obstacle_half_size: half edge, or radius, of the obstacle itself, m. Feet reach 0.35 m from the base: up to 0.3 m
-            nothing touches it while the base is outside U.
+        obstacle_half_size: half edge, or radius, of the obstacle itself, m. Feet reach 0.35 m from the base: up to 0.3
+            m nothing touches it while the base is outside U.
         obstacle_centre: (x, y), m.
         meshes: draw the robot's meshes (thirty times slower); agents are trained on the plain shapes.
         render_mode: "rgb_array", "human" (a window) or None.
 
-    Raises:
-        MissingDependencyError: PyBullet, its data or daqp is missing.
-        ConfigError: a parameter is not valid, or a window is asked for where there is no display.
-
-    Source: paper, Section IV-B. Deviation: leaving the arena is defined; yaw rates are slew limited in the controller.
+    Raises MissingDependencyError without PyBullet, its data or daqp; ConfigError for a parameter that is not valid, or
+    for a window where there is no display. Source: paper, Section IV-B. Deviation: leaving the arena is defined; yaw
+    rates are slew limited in the controller.
 
     Example:
         >>> env = QuadrupedEnv()  # doctest: +SKIP
@@ -62,7 +60,7 @@ class QuadrupedEnv(gymnasium.Env):
         >>> pixels, reward, terminated, truncated, info = env.step(np.array([0.5]))  # doctest: +SKIP
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # type: ignore[misc]
+    metadata: ClassVar = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
     _gait: ClassVar[list[Snapshot]] = []
 
     def __init__(
@@ -82,24 +80,21 @@ class QuadrupedEnv(gymnasium.Env):
         render_mode: str | None = None,
     ) -> None:
         check_positive(
-            max_yaw_rate=max_yaw_rate,
-            speed=speed,
-            dt=dt,
-            arena_half_size=arena_half_size,
-            safe_half_size=safe_half_size,
-            unsafe_half_size=unsafe_half_size,
-            obstacle_half_size=obstacle_half_size,
-        )
+            max_yaw_rate=max_yaw_rate, speed=speed, dt=dt, arena_half_size=arena_half_size,
+            safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size, obstacle_half_size=obstacle_half_size,
+        )  # fmt: skip
         if not obstacle_half_size <= unsafe_half_size < safe_half_size:
             raise ConfigError(
-                f"sizes: expected obstacle <= unsafe < safe, received {obstacle_half_size}, {unsafe_half_size}, {safe_half_size}."
+                "sizes: expected obstacle <= unsafe < safe, received "
+                f"{obstacle_half_size}, {unsafe_half_size}, {safe_half_size}."
             )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(
                 f"render_mode: expected None or one of {self.metadata['render_modes']}, received {render_mode!r}."
             )
         self.max_yaw_rate, self.speed, self.dt = float(max_yaw_rate), float(speed), float(dt)
-        self.arena_half_size, self.safe_half_size, self.unsafe_half_size = arena_half_size, safe_half_size, unsafe_half_size
+        self.arena_half_size = arena_half_size
+        self.safe_half_size, self.unsafe_half_size = safe_half_size, unsafe_half_size
         self.obstacle_shape, self.obstacle_centre = obstacle_shape, np.asarray(obstacle_centre, dtype=np.float64)
         self.render_mode = render_mode
         self._client = connect(gui=render_mode == "human")
@@ -121,19 +116,10 @@ class QuadrupedEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.uint8], dict[str, Any]]:
-        """Start an episode: the robot walks straight ahead, in a steady gait, at a pose.
+        """Start: the robot walks straight ahead, in a steady gait, at a pose; frames and info as in ``step``.
 
-        Args:
-            seed: of the starts.
-            options: "pose", (x, y, heading) [m, m, rad]; default uniform in S. "phase", of the gait in [0, 1);
-                default uniform.
-
-        Returns:
-            Frames uint8 ``(6, H, W)``, one step ago and now; info.
-
-        Raises:
-            ConfigError: an option is not known.
-            ShapeError, NonFiniteError: the pose is not three finite numbers.
+        Options: "pose", (x, y, heading) [m, m, rad], default uniform in S; "phase", of the gait in [0, 1), default
+        uniform. Raises ConfigError for others; ShapeError or NonFiniteError unless the pose is three finite numbers.
         """
         super().reset(seed=seed)
         given = dict(options or {})
@@ -153,18 +139,12 @@ class QuadrupedEnv(gymnasium.Env):
         return self._frames.copy(), self._info(contact)
 
     def step(self, action: Any) -> tuple[NDArray[np.uint8], float, bool, bool, dict[str, Any]]:
-        """Walk for ``dt``.
+        """Walk for ``dt`` at a yaw rate ``(1,)`` in rad/s.
 
-        Args:
-            action: yaw rate ``(1,)``, rad/s.
-
-        Returns:
-            Frames, reward (minus the cost), terminated (fallen, or left the arena), False, info.
-
-        Raises:
-            ShapeError, NonFiniteError: the action is not one finite number; the robot has not moved.
-            SolverError: the controller found no forces many times in a row.
-            ConfigError: the episode was not started.
+        Returns frames uint8 ``(6, H, W)``, one step ago and now, reward (minus the cost), terminated (fallen, or left
+        the arena), False, info. Raises ConfigError if the episode was not started; ShapeError or NonFiniteError, and
+        nothing moves, unless the action is one finite number; SolverError if the controller found no forces many times
+        in a row.
         """
         if self._frames is None:
             raise ConfigError("step: expected a reset before the first step, received none; call reset().")
@@ -184,8 +164,6 @@ class QuadrupedEnv(gymnasium.Env):
         if self._client is not None:
             self._client.disconnect()
             self._client = None
-
-    # -- parts ----------------------------------------------------------------------------------------------------------
 
     def _walk(self, rate: float) -> bool:
         """Simulate one step at a yaw rate; whether the obstacle was touched."""
@@ -233,6 +211,3 @@ def _numbers(name: str, value: Any, n: int) -> list[float]:
     if not np.isfinite(array).all():
         raise NonFiniteError(f"{name}: expected finite numbers, received {array.tolist()}; check the policy's output.")
     return array.tolist()
-
-
-__all__ = ["QuadrupedEnv"]

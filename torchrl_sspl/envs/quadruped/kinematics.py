@@ -13,29 +13,20 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 LEGS = ("FR", "FL", "RR", "RL")
-SIDE = np.array([-1.0, 1.0, -1.0, 1.0])
-ABDUCTION = np.array([[0.183, -0.047, 0.0], [0.183, 0.047, 0.0], [-0.183, -0.047, 0.0], [-0.183, 0.047, 0.0]])
-"""Abduction joints in the base frame, in m."""
-ABDUCTION_LINK, THIGH, SHANK, TOE_RADIUS = 0.08505, 0.2, 0.2, 0.02
-"""Lengths in m; the foot of this module is the centre of the spherical toe."""
-SHOULDER = ABDUCTION + np.stack([0 * SIDE, ABDUCTION_LINK * SIDE, 0 * SIDE], axis=1)
+_SIDE = np.array([-1.0, 1.0, -1.0, 1.0])
+_ABDUCTION = np.array([[0.183, -0.047, 0.0], [0.183, 0.047, 0.0], [-0.183, -0.047, 0.0], [-0.183, 0.047, 0.0]])
+_LINK, _THIGH, _SHANK, TOE_RADIUS = 0.08505, 0.2, 0.2, 0.02  # m; a foot is the centre of the spherical toe
+SHOULDER = _ABDUCTION + np.stack([0 * _SIDE, _LINK * _SIDE, 0 * _SIDE], axis=1)
 """Where the feet are below when the robot stands, in the base frame, in m."""
-
-_REACH = 0.995 * (THIGH + SHANK)
+_REACH = 0.995 * (_THIGH + _SHANK)
 _KNEE = (-2.69, -0.92)
-_ABDUCTION_LIMIT = 0.8
+_LIMIT = 0.8
 
 
 def forward_kinematics(joints: Array) -> tuple[Array, Array]:
-    """Feet and their Jacobians.
+    """Feet ``(4, 3)`` in the base frame in m, and Jacobians ``(4, 3, 3)``, foot velocity per joint velocity.
 
-    Args:
-        joints: ``(4, 3)`` joint angles in rad.
-
-    Returns:
-        feet ``(4, 3)`` in the base frame in m, and Jacobians ``(4, 3, 3)``, foot velocity per joint velocity.
-
-    Source: geometry of the robot's URDF.
+    The joint angles are ``(4, 3)`` in rad. Source: geometry of the robot's URDF.
 
     Example:
         >>> feet, jacobian = forward_kinematics(np.zeros((4, 3)))
@@ -46,14 +37,14 @@ def forward_kinematics(joints: Array) -> tuple[Array, Array]:
     knee = joints[:, 1] + joints[:, 2]
     sin_knee, cos_knee = np.sin(knee), np.cos(knee)
     # In the plane of the leg: x forward, down along -z; the abduction joint turns that plane about x.
-    x = -THIGH * sin[:, 1] - SHANK * sin_knee
-    z = -THIGH * cos[:, 1] - SHANK * cos_knee
-    y = SIDE * ABDUCTION_LINK
+    x = -_THIGH * sin[:, 1] - _SHANK * sin_knee
+    z = -_THIGH * cos[:, 1] - _SHANK * cos_knee
+    y = _SIDE * _LINK
     s, c = sin[:, 0], cos[:, 0]
-    feet = ABDUCTION + np.stack([x, c * y - s * z, s * y + c * z], axis=1)
+    feet = _ABDUCTION + np.stack([x, c * y - s * z, s * y + c * z], axis=1)
     jacobian = np.zeros((4, 3, 3))
-    jacobian[:, 1, 0], jacobian[:, 2, 0] = ABDUCTION[:, 2] - feet[:, 2], feet[:, 1] - ABDUCTION[:, 1]
-    dx, dz = -SHANK * cos_knee, SHANK * sin_knee
+    jacobian[:, 1, 0], jacobian[:, 2, 0] = _ABDUCTION[:, 2] - feet[:, 2], feet[:, 1] - _ABDUCTION[:, 1]
+    dx, dz = -_SHANK * cos_knee, _SHANK * sin_knee
     jacobian[:, 0, 1], jacobian[:, 0, 2] = z, dx
     jacobian[:, 1, 1], jacobian[:, 1, 2] = s * x, -s * dz
     jacobian[:, 2, 1], jacobian[:, 2, 2] = -c * x, c * dz
@@ -61,40 +52,29 @@ def forward_kinematics(joints: Array) -> tuple[Array, Array]:
 
 
 def inverse_kinematics(feet: Array) -> Array:
-    """Joint angles that put the feet where they are wanted, or as near as the legs reach.
+    """Joint angles ``(4, 3)`` in rad that put feet ``(4, 3)`` in the base frame in m, or as near as the legs reach.
 
-    Args:
-        feet: ``(4, 3)`` in the base frame in m.
-
-    Returns:
-        ``(4, 3)`` joint angles in rad, within the joint limits, knees bent backwards.
-
-    Source: geometry of the robot's URDF.
+    Within the joint limits, knees bent backwards. Source: geometry of the robot's URDF.
 
     Example:
         >>> feet = SHOULDER + [0.05, 0.02, -0.28]
         >>> bool(np.allclose(forward_kinematics(inverse_kinematics(feet))[0], feet))
         True
     """
-    x, y, z = (feet - ABDUCTION).T
-    side = SIDE * ABDUCTION_LINK
+    x, y, z = (feet - _ABDUCTION).T
+    side = _SIDE * _LINK
     depth = np.sqrt(np.maximum(y * y + z * z - side * side, 1e-4))
     abduction = np.arctan2(z, y) - np.arctan2(-depth, side)
     abduction = (abduction + np.pi) % (2 * np.pi) - np.pi
     squared = np.minimum(x * x + depth * depth, _REACH**2)
-    bend = (squared - THIGH**2 - SHANK**2) / (2 * THIGH * SHANK)
+    bend = (squared - _THIGH**2 - _SHANK**2) / (2 * _THIGH * _SHANK)
     knee = -np.arccos(np.clip(bend, -1.0, 1.0))
-    hip = np.arctan2(-x, depth) - np.arctan2(SHANK * np.sin(knee), THIGH + SHANK * np.cos(knee))
-    return np.stack([np.clip(abduction, -_ABDUCTION_LIMIT, _ABDUCTION_LIMIT), hip, np.clip(knee, *_KNEE)], axis=1)
+    hip = np.arctan2(-x, depth) - np.arctan2(_SHANK * np.sin(knee), _THIGH + _SHANK * np.cos(knee))
+    return np.stack([np.clip(abduction, -_LIMIT, _LIMIT), hip, np.clip(knee, *_KNEE)], axis=1)
 
 
 def rotation_z(angle: float) -> Array:
-    """Rotation matrix ``(3, 3)`` about the vertical by an angle in rad.
-
-    Example:
-        >>> (rotation_z(np.pi / 2) @ [1.0, 0.0, 0.0]).round(12).tolist()
-        [0.0, 1.0, 0.0]
-    """
+    """Rotation matrix ``(3, 3)`` about the vertical by an angle in rad."""
     cos, sin = np.cos(angle), np.sin(angle)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -115,23 +95,5 @@ def skew(vectors: Array) -> Array:
 
 
 def wrap_angle(angle: float) -> float:
-    """Angle in [-pi, pi), in rad.
-
-    Example:
-        >>> round(wrap_angle(3 * np.pi / 2), 6)
-        -1.570796
-    """
+    """Angle in [-pi, pi), in rad."""
     return float((angle + np.pi) % (2 * np.pi) - np.pi)
-
-
-__all__ = [
-    "ABDUCTION",
-    "LEGS",
-    "SHOULDER",
-    "TOE_RADIUS",
-    "forward_kinematics",
-    "inverse_kinematics",
-    "rotation_z",
-    "skew",
-    "wrap_angle",
-]

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from torchrl_sspl.envs.quadruped.controller import Body, Measurement, Memory, WalkingController
-from torchrl_sspl.envs.quadruped.gait import GRAVITY
+from torchrl_sspl.envs.quadruped.gait import GRAVITY, HEIGHT, PERIOD
 from torchrl_sspl.envs.quadruped.kinematics import LEGS, SHOULDER, TOE_RADIUS, Array, inverse_kinematics, rotation_z
 from torchrl_sspl.envs.quadruped.mpc import Solver, solve_daqp
 from torchrl_sspl.envs.quadruped.world import add_ground, add_robot
@@ -35,8 +35,7 @@ class WalkingRobot:
         solver: quadratic program solver of the controller.
         meshes: draw the robot's meshes.
 
-    Raises:
-        MissingDependencyError: PyBullet's data or daqp is missing.
+    Raises MissingDependencyError without PyBullet's data or daqp.
     """
 
     def __init__(self, client: Any, *, dt: float = 0.002, solver: Solver = solve_daqp, meshes: bool = False) -> None:
@@ -54,7 +53,6 @@ class WalkingRobot:
         # axes of its inertia; this is where they lie in the base frame.
         info = client.getDynamicsInfo(self.body_id, -1)
         self._offset, self._offset_turn = np.array(info[3]), _matrix(client, info[4])
-        self._offset_pose = (list(info[3]), list(info[4]))
         self._set_standing()
         self.controller = WalkingController(self._mass_distribution(), dt=dt, solver=solver)
         self.stand()
@@ -67,9 +65,7 @@ class WalkingRobot:
     def step(self, command: Array | list[float]) -> None:
         """Walk for ``dt`` at a command ``(3,)``: forward and lateral velocity in m/s, yaw rate in rad/s.
 
-        Raises:
-            ShapeError, NonFiniteError: the command is not three finite numbers; the robot has not moved.
-            SolverError: the controller found no forces many times in a row.
+        Raises as ``WalkingController.torques``; the robot has not moved then.
         """
         torques = self.controller.torques(self.measured, command)
         self.client.setJointMotorControlArray(
@@ -89,63 +85,40 @@ class WalkingRobot:
         tilt = np.abs(self.measured.roll_pitch_yaw[:2]).max()
         return bool(self.measured.position[2] < _FALLEN_HEIGHT or tilt > _FALLEN_TILT)
 
-    def snapshot(self) -> Snapshot:
-        """This moment, to be continued later or elsewhere."""
-        return Snapshot(self.measured, self.controller.memory)
-
     def place(self, snapshot: Snapshot, x: float, y: float, heading: float) -> None:
         """Continue a snapshot with the base at (x, y) in m and with a heading in rad."""
         then = snapshot.measured
         angle = heading - float(then.roll_pitch_yaw[2])
         turn = rotation_z(angle)
         shift = np.array([x, y, then.position[2]]) - turn @ then.position
-        self._set(
-            Measurement(
-                turn @ then.position + shift,
-                turn @ then.rotation,
-                turn @ then.velocity,
-                turn @ then.angular_velocity,
-                then.joints,
-                then.joint_velocities,
-            )
-        )
+        turned = (turn @ value for value in (then.rotation, then.velocity, then.angular_velocity))
+        self.pose_as(Measurement(turn @ then.position + shift, *turned, then.joints, then.joint_velocities))
         self.controller.reset(self.measured, snapshot.memory.moved(angle, shift))
-
-    def pose_as(self, measured: Measurement) -> None:
-        """Put the body in a state, without the controller: for pictures."""
-        self._set(measured)
 
     def steady_gait(self, interval: int = 5) -> list[Snapshot]:
         """One period of walking straight ahead at 1 m/s, after 2.9 s in which the gait settles.
 
-        Args:
-            interval: time steps between snapshots.
-
-        Returns:
-            Snapshots at phases 0, interval dt / period, ... of the gait.
+        Snapshots are ``interval`` time steps apart, at phases 0, interval dt / period, ... of the gait.
         """
         self.stand()
-        period = round(self.controller.trot.period / self.dt)
+        period = round(PERIOD / self.dt)
         for _ in range(_SETTLING_PERIODS * period):
             self.step(_STRAIGHT)
         snapshots = []
         for k in range(period):
             if k % interval == 0:
-                snapshots.append(self.snapshot())
+                snapshots.append(Snapshot(self.measured, self.controller.memory))
             self.step(_STRAIGHT)
         return snapshots
 
-    # -- PyBullet ---------------------------------------------------------------------------------------------------
-
     def _set_standing(self, x: float = 0.0, y: float = 0.0, heading: float = 0.0, centre: float = 0.0) -> None:
-        height = 0.28
-        feet = SHOULDER + np.array([centre, 0.0, TOE_RADIUS - height])  # the centre of mass above the middle of the feet
-        still = np.zeros(3)
-        position = np.array([x, y, height])
-        joints = inverse_kinematics(feet)
-        self._set(Measurement(position, rotation_z(heading), still, still, joints, np.zeros((4, 3))))
+        # The centre of mass is above the middle of the feet.
+        joints = inverse_kinematics(SHOULDER + np.array([centre, 0.0, TOE_RADIUS - HEIGHT]))
+        position, still = np.array([x, y, HEIGHT]), np.zeros(3)
+        self.pose_as(Measurement(position, rotation_z(heading), still, still, joints, np.zeros((4, 3))))
 
-    def _set(self, state: Measurement) -> None:
+    def pose_as(self, state: Measurement) -> None:
+        """Put the body in a state, without the controller: for pictures."""
         client = self.client
         offset = state.rotation @ self._offset
         turned = state.rotation @ self._offset_turn
@@ -208,18 +181,11 @@ def _matrix(client: Any, quaternion: Any) -> Array:
 def _quaternion(rotation: Array) -> Array:
     """Quaternion (x, y, z, w) of a rotation matrix."""
     r = rotation
-    squares = np.array([1 + r[0, 0] - r[1, 1] - r[2, 2], 1 - r[0, 0] + r[1, 1] - r[2, 2],
-                        1 - r[0, 0] - r[1, 1] + r[2, 2], 1 + r[0, 0] + r[1, 1] + r[2, 2]])  # fmt: skip
-    k = int(np.argmax(squares))
-    if k == 3:
-        q = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], squares[3]])
-    elif k == 0:
-        q = np.array([squares[0], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]])
-    elif k == 1:
-        q = np.array([r[0, 1] + r[1, 0], squares[1], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]])
-    else:
-        q = np.array([r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], squares[2], r[1, 0] - r[0, 1]])
+    symmetric = np.array([
+        [1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0], r[2, 1] - r[1, 2]],
+        [r[0, 1] + r[1, 0], 1 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1], r[0, 2] - r[2, 0]],
+        [r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - r[0, 0] - r[1, 1] + r[2, 2], r[1, 0] - r[0, 1]],
+        [r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1], 1 + r[0, 0] + r[1, 1] + r[2, 2]],
+    ])  # fmt: skip
+    q = symmetric[np.argmax(np.diag(symmetric))]
     return q / np.linalg.norm(q)
-
-
-__all__ = ["Snapshot", "WalkingRobot"]

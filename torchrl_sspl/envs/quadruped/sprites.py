@@ -1,8 +1,6 @@
 """Pictures of the walking robot from above, one per gait phase, drawn once by PyBullet's renderer.
 
-The file in the package is made by
-
-    python -m torchrl_sspl.envs.quadruped.sprites [path]
+``python -m torchrl_sspl.envs.quadruped.sprites [path]`` makes the file in the package.
 """
 
 from __future__ import annotations
@@ -18,29 +16,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from torchrl_sspl.envs.quadruped.camera import CAMERA_HEIGHT, TopCamera
+from torchrl_sspl.envs.quadruped.camera import TopCamera
 from torchrl_sspl.envs.quadruped.controller import Measurement
+from torchrl_sspl.envs.quadruped.gait import PERIOD
+from torchrl_sspl.envs.quadruped.kinematics import rotation_z
 from torchrl_sspl.errors import CheckpointError
 
-SPRITE_FILE = Path(__file__).with_name("sprites.npz")
-PHASES = 36
-TEXEL = 0.0025
-"""Size of a texel of a sprite, in m on the ground under the camera."""
-HEIGHT_UNIT = 0.002
-"""Unit of the heights of a sprite, in m."""
+TEXEL = 0.0025  # m on the ground under the camera, size of a texel of a sprite
+HEIGHT_UNIT = 0.002  # m, of the heights of a sprite
 
+_SPRITE_FILE = Path(__file__).with_name("sprites.npz")
+_PHASES = 36  # a divisor of 180, the time steps in a period of the gait
 _SIZE = 352  # texels: 0.88 m, and the robot reaches 0.4 m from the middle of its base
-_STILL = np.zeros(3)
 
 
 @dataclass(frozen=True)
 class Sprites:
     """The robot at ``n`` phases of its gait, heading along x, from straight above.
-
-    Args:
-        colours: uint8 ``(n, size, size, 3)``; row 0 is on the robot's left.
-        heights: uint8 ``(n, size, size)`` in units of 2 mm; 0 where nothing of the robot is seen.
-        postures: float32 ``(n, 22)``: height of the base in m, its rotation (9, row by row; yaw 0), 12 joints in rad.
 
     Example:
         >>> sprites = load_sprites()
@@ -48,15 +40,11 @@ class Sprites:
         ((36, 352, 352, 3), dtype('uint8'))
     """
 
-    colours: NDArray[np.uint8]
-    heights: NDArray[np.uint8]
-    postures: NDArray[np.float32]
+    colours: NDArray[np.uint8]  # (n, size, size, 3); row 0 is on the robot's left
+    heights: NDArray[np.uint8]  # (n, size, size) in units of 2 mm; 0 where nothing of the robot is seen
+    postures: NDArray[np.float32]  # (n, 22): height of the base in m, its rotation (row by row; yaw 0), joints in rad
 
-    def posture(self, index: int, x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> Measurement:
-        """State of the robot in picture ``index``, at (x, y) in m with a heading in rad."""
-        return posture_at(self.postures[index], x, y, heading)
-
-    def save(self, path: str | Path = SPRITE_FILE) -> None:
+    def save(self, path: str | Path) -> None:
         """Write an npz file whose bytes depend on the contents alone."""
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
             for name in ("colours", "heights", "postures"):
@@ -66,12 +54,8 @@ class Sprites:
 
 
 @functools.lru_cache(maxsize=2)
-def load_sprites(path: str | Path = SPRITE_FILE) -> Sprites:
-    """Read sprites, by default those of the package; PyBullet is not needed.
-
-    Raises:
-        CheckpointError: the file is missing or damaged.
-    """
+def load_sprites(path: str | Path = _SPRITE_FILE) -> Sprites:
+    """Read sprites, by default those of the package; CheckpointError if the file is missing or damaged."""
     try:
         with np.load(path, allow_pickle=False) as data:
             sprites = Sprites(data["colours"], data["heights"], data["postures"])
@@ -83,51 +67,36 @@ def load_sprites(path: str | Path = SPRITE_FILE) -> Sprites:
     n = len(sprites.postures)
     if sprites.colours.shape != (n, *sprites.heights.shape[1:], 3) or sprites.postures.shape != (n, 22) or n < 1:
         raise CheckpointError(
-            f"sprites: expected colours (n, size, size, 3), heights (n, size, size) and postures (n, 22) in {path}, "
-            f"received {sprites.colours.shape}, {sprites.heights.shape}, {sprites.postures.shape}; reinstall the package."
+            f"sprites: expected colours (n, size, size, 3), heights (n, size, size) and postures (n, 22) in {path}, received "
+            f"{sprites.colours.shape}, {sprites.heights.shape}, {sprites.postures.shape}; reinstall the package."
         )
     return sprites
 
 
-def posture_of(measured: Measurement) -> NDArray[np.float32]:
-    """Height, rotation without yaw, and joints of a robot, ``(22,)``; the inverse of ``posture_at``."""
-    from torchrl_sspl.envs.quadruped.kinematics import rotation_z
+def posture_at(posture: NDArray[np.float32], x: float = 0.0, y: float = 0.0, heading: float = 0.0) -> Measurement:
+    """Robot in a posture ``(22,)`` at (x, y) in m with a heading in rad, at rest."""
+    values = posture.astype(np.float64)
+    turned, joints = rotation_z(heading) @ values[1:10].reshape(3, 3), values[10:].reshape(4, 3)
+    return Measurement(np.array([x, y, values[0]]), turned, np.zeros(3), np.zeros(3), joints, np.zeros((4, 3)))
 
+
+def _posture_of(measured: Measurement) -> NDArray[np.float32]:
+    """Height, rotation without yaw, and joints of a robot, ``(22,)``; the inverse of ``posture_at``."""
     level = rotation_z(-float(measured.roll_pitch_yaw[2])) @ measured.rotation
     return np.concatenate([measured.position[2:], level.ravel(), measured.joints.ravel()]).astype(np.float32)
 
 
-def posture_at(posture: NDArray[np.float32], x: float, y: float, heading: float) -> Measurement:
-    """Robot in a posture ``(22,)`` at (x, y) in m with a heading in rad, at rest."""
-    from torchrl_sspl.envs.quadruped.kinematics import rotation_z
-
-    values = posture.astype(np.float64)
-    return Measurement(
-        np.array([x, y, values[0]]),
-        rotation_z(heading) @ values[1:10].reshape(3, 3),
-        _STILL,
-        _STILL,
-        values[10:].reshape(4, 3),
-        np.zeros((4, 3)),
-    )
-
-
-def draw_sprites(client: Any, phases: int = PHASES) -> Sprites:
-    """Walk straight ahead at 1 m/s in a PyBullet world and draw the robot at phases of its gait.
-
-    Args:
-        client: PyBullet client of an empty world.
-        phases: number of pictures; a divisor of 180, the time steps in a period of the gait.
-    """
+def draw_sprites(client: Any) -> Sprites:
+    """Walk straight ahead at 1 m/s in the empty world of a PyBullet client and draw the robot at phases of its gait."""
     from torchrl_sspl.envs.quadruped.robot import WalkingRobot
 
     robot = WalkingRobot(client)
-    period = round(robot.controller.trot.period / robot.dt)
-    postures = np.stack([posture_of(s.measured) for s in robot.steady_gait(period // phases)])
-    camera = TopCamera(client, _SIZE, half_view=_SIZE * TEXEL / 2, height=CAMERA_HEIGHT, supersample=1)
+    interval = round(PERIOD / robot.dt) // _PHASES
+    postures = np.stack([_posture_of(s.measured) for s in robot.steady_gait(interval)])
+    camera = TopCamera(client, _SIZE, half_view=_SIZE * TEXEL / 2, supersample=1)
     colours, heights = [], []
     for posture in postures:
-        robot.pose_as(posture_at(posture, 0.0, 0.0, 0.0))
+        robot.pose_as(posture_at(posture))
         picture, bodies = camera.raw(_SIZE)
         seen = bodies == robot.body_id
         level = np.clip(np.round(camera.depth(_SIZE) / HEIGHT_UNIT), 1, 255)
@@ -136,17 +105,14 @@ def draw_sprites(client: Any, phases: int = PHASES) -> Sprites:
     return Sprites(np.stack(colours), np.stack(heights), postures)
 
 
-def main() -> None:
+def _main() -> None:
     """Draw the sprites of the package."""
     from torchrl_sspl.envs.quadruped.world import connect
 
-    path = Path(sys.argv[1]) if len(sys.argv) > 1 else SPRITE_FILE
+    path = Path(sys.argv[1]) if len(sys.argv) > 1 else _SPRITE_FILE
     draw_sprites(connect()).save(path)
     print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
 
 
 if __name__ == "__main__":
-    main()
-
-
-__all__ = ["HEIGHT_UNIT", "PHASES", "SPRITE_FILE", "TEXEL", "Sprites", "draw_sprites", "load_sprites"]
+    _main()

@@ -2,36 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import functools
 import os
+import sys
 import tempfile
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 
+# In m: tall enough to be hit by legs and body, low enough that the back of a robot is always seen from above.
 OBSTACLE_HEIGHT = 0.25
-"""In m: tall enough to be hit by legs and body, low enough that the back of a robot is always seen from above."""
-
-TRUNK_COLOUR = (0.10, 0.25, 0.85, 1.0)
-LEG_COLOUR = (0.20, 0.20, 0.22, 1.0)
-HEAD_COLOUR = (1.0, 0.85, 0.0, 1.0)
 OBSTACLE_COLOUR = (0.85, 0.15, 0.15, 1.0)
+_TRUNK_COLOUR = (0.10, 0.25, 0.85, 1.0)
+_LEG_COLOUR = (0.20, 0.20, 0.22, 1.0)
+_HEAD_COLOUR = (1.0, 0.85, 0.0, 1.0)
 _HEAD_PLATE = {"xyz": "0.2 0 0.06", "size": "0.14 0.24 0.02"}
 _GROUND_FRICTION, _TOE_FRICTION = 0.9, 1.0
 _SHAPES = ("square", "disc")
 
 
 def import_pybullet() -> tuple[ModuleType, str]:
-    """PyBullet and the directory of its data.
-
-    Raises:
-        MissingDependencyError: PyBullet, or the A1 in its data, is missing.
-    """
+    """PyBullet and the directory of its data; MissingDependencyError without PyBullet or the A1 in its data."""
     try:
         with _quiet():
             import pybullet
@@ -50,14 +47,9 @@ def import_pybullet() -> tuple[ModuleType, str]:
 
 
 def connect(gui: bool = False) -> Any:
-    """A world of its own: a PyBullet client without gravity and without bodies.
+    """A world of its own: a PyBullet client without gravity and without bodies, ``gui``: in a window.
 
-    Args:
-        gui: show it in a window.
-
-    Raises:
-        MissingDependencyError: PyBullet is missing.
-        ConfigError: a window is asked for and there is no display.
+    Raises MissingDependencyError without PyBullet; ConfigError if a window is asked for and there is no display.
     """
     pybullet, _ = import_pybullet()
     from pybullet_utils import bullet_client
@@ -81,54 +73,41 @@ def add_ground(client: Any) -> int:
 
 
 def add_obstacle(client: Any, shape: str, half_size: float, centre: Sequence[float]) -> int:
-    """A box or a cylinder that stands on the ground.
+    """A box ("square") or cylinder ("disc") on the ground at (x, y), ``half_size`` its half edge or radius, all in m.
 
-    Args:
-        client: PyBullet client.
-        shape: "square" or "disc".
-        half_size: half of the edge, or the radius, in m.
-        centre: (x, y) in m.
-
-    Raises:
-        ConfigError: the shape is not known.
+    Raises ConfigError for another shape.
     """
     if shape not in _SHAPES:
         raise ConfigError(f"obstacle_shape: expected one of {list(_SHAPES)}, received {shape!r}.")
     if shape == "square":
+        kind: int = client.GEOM_BOX
         size: dict[str, Any] = {"halfExtents": [half_size, half_size, OBSTACLE_HEIGHT / 2]}
-        solid, seen = client.createCollisionShape(client.GEOM_BOX, **size), size
-        kind = client.GEOM_BOX
+        solid = client.createCollisionShape(kind, **size)
     else:
-        solid = client.createCollisionShape(client.GEOM_CYLINDER, radius=half_size, height=OBSTACLE_HEIGHT)
-        seen, kind = {"radius": half_size, "length": OBSTACLE_HEIGHT}, client.GEOM_CYLINDER
-    drawn = client.createVisualShape(kind, rgbaColor=OBSTACLE_COLOUR, **seen)
+        kind, size = client.GEOM_CYLINDER, {"radius": half_size, "length": OBSTACLE_HEIGHT}
+        solid = client.createCollisionShape(kind, radius=half_size, height=OBSTACLE_HEIGHT)
+    drawn = client.createVisualShape(kind, rgbaColor=OBSTACLE_COLOUR, **size)
     return client.createMultiBody(0, solid, drawn, [*centre, OBSTACLE_HEIGHT / 2])
 
 
 def add_robot(client: Any, *, meshes: bool = False) -> int:
-    """The Unitree A1 of PyBullet's data.
+    """The Unitree A1 of PyBullet's data, drawn by its collision shapes in plain colours, with a yellow plate as head.
 
-    Args:
-        client: PyBullet client.
-        meshes: draw its meshes; else its collision shapes in plain colours, thirty times faster, with a yellow
-            plate that shows where its head is. Masses and collision shapes are the same.
-
-    Raises:
-        MissingDependencyError: PyBullet's data or a mesh is missing.
+    ``meshes``: draw its meshes instead, thirty times slower; masses and collision shapes are the same. Raises
+    MissingDependencyError without PyBullet's data or a mesh.
     """
     _, data = import_pybullet()
     folder = Path(data) / "a1"
+    path = str(folder / "a1.urdf")
     if meshes:
-        urdf = ElementTree.parse(folder / "a1.urdf")
-        for mesh in urdf.iter("mesh"):
+        for mesh in ElementTree.parse(path).iter("mesh"):
             if not (folder / mesh.attrib["filename"]).is_file():
                 raise MissingDependencyError(
                     f"The robot: expected the mesh {mesh.attrib['filename']} in {folder}, found none; reinstall "
                     "pybullet or use meshes=False."
                 )
-        path = str(folder / "a1.urdf")
     else:
-        path = _plain_urdf(str(folder / "a1.urdf"))
+        path = _plain_urdf(path)
     with _quiet():
         robot = client.loadURDF(path, [0, 0, 0.3], flags=client.URDF_USE_INERTIA_FROM_FILE)
     for link in range(-1, client.getNumJoints(robot)):
@@ -150,11 +129,11 @@ def _plain_urdf(source: str) -> str:
         geometry = None if collision is None else collision.find("geometry")
         if collision is not None and geometry is not None and geometry.find("mesh") is None:
             parts = [copy.deepcopy(part) for part in (collision.find("origin"), geometry) if part is not None]
-            _add_visual(link, parts, TRUNK_COLOUR if trunk else LEG_COLOUR)
+            _add_visual(link, parts, _TRUNK_COLOUR if trunk else _LEG_COLOUR)
         if trunk:
             plate = ElementTree.Element("geometry")
             ElementTree.SubElement(plate, "box", size=_HEAD_PLATE["size"])
-            _add_visual(link, [ElementTree.Element("origin", xyz=_HEAD_PLATE["xyz"], rpy="0 0 0"), plate], HEAD_COLOUR)
+            _add_visual(link, [ElementTree.Element("origin", xyz=_HEAD_PLATE["xyz"], rpy="0 0 0"), plate], _HEAD_COLOUR)
     handle, path = tempfile.mkstemp(prefix="a1_", suffix=".urdf", dir=_temporary().name)
     os.close(handle)
     tree.write(path)
@@ -177,7 +156,7 @@ def _temporary() -> tempfile.TemporaryDirectory[str]:
 
 def _check_display() -> None:
     """Raise unless a window can be opened: PyBullet would end the whole process."""
-    if os.name != "posix" or os.uname().sysname != "Linux":
+    if sys.platform != "linux":
         return
     name = os.environ.get("DISPLAY")
     if name:
@@ -200,31 +179,16 @@ def _check_display() -> None:
     )
 
 
-class _quiet:
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
     """Keep what a C library prints away from standard output and standard error."""
-
-    def __enter__(self) -> None:
-        self._null = os.open(os.devnull, os.O_WRONLY)
-        self._saved = [(stream, os.dup(stream)) for stream in (1, 2)]
-        for stream, _ in self._saved:
-            os.dup2(self._null, stream)
-
-    def __exit__(self, *_: object) -> None:
-        for stream, copied in self._saved:
+    null, saved = os.open(os.devnull, os.O_WRONLY), [(stream, os.dup(stream)) for stream in (1, 2)]
+    for stream, _ in saved:
+        os.dup2(null, stream)
+    try:
+        yield
+    finally:
+        for stream, copied in saved:
             os.dup2(copied, stream)
             os.close(copied)
-        os.close(self._null)
-
-
-__all__ = [
-    "HEAD_COLOUR",
-    "LEG_COLOUR",
-    "OBSTACLE_COLOUR",
-    "OBSTACLE_HEIGHT",
-    "TRUNK_COLOUR",
-    "add_ground",
-    "add_obstacle",
-    "add_robot",
-    "connect",
-    "import_pybullet",
-]
+        os.close(null)
