@@ -12,7 +12,13 @@ from typing import Any
 
 from torchrl_sspl.errors import CheckpointError, ConfigError, SSPLError
 
-TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
+_USAGE = """sspl COMMAND ...
+
+  train     train an agent, evaluate it and write its report; `sspl train --help` lists every field
+  evaluate  measure an agent again, on fresh data
+  verify    check the certificates of an agent again
+  compare   a page with several runs beside each other"""
+_TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
 
 Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Started again with
 the same out_dir it continues where it was interrupted.
@@ -39,10 +45,7 @@ _INSTEAD = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command.
-
-    Args:
-        arguments: words after ``sspl``; by default those of the command line.
+    """Run a command: the words after ``sspl``, by default those of the command line.
 
     Returns 0; 1 if a verification or a run of several fails; 2 for a wrong argument, with the reason on standard error.
     Source: none.
@@ -53,17 +56,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    commands = {"train": train, "evaluate": evaluate, "verify": verify, "compare": compare}
+    commands = {"train": _train, "evaluate": _evaluate, "verify": _verify, "compare": _compare}
     if words[:1] == ["--version"]:
         from torchrl_sspl import __version__
 
         print(f"torchrl_sspl {__version__}")
         return 0
     if not words or words[0] in ("-h", "--help"):
-        print(_usage())
+        print(_USAGE)
         return 0 if words else 2
     if words[0] not in commands:
-        print(f"expected a command, one of {', '.join(commands)}, received '{words[0]}'\n\n{_usage()}", file=sys.stderr)
+        print(f"expected a command, one of {', '.join(commands)}, received '{words[0]}'\n\n{_USAGE}", file=sys.stderr)
         return 2
     try:
         return commands[words[0]](words[1:])
@@ -72,25 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _usage() -> str:
-    return (
-        "sspl COMMAND ...\n\n"
-        "  train     train an agent, evaluate it and write its report; `sspl train --help` lists every field\n"
-        "  evaluate  measure an agent again, on fresh data\n"
-        "  verify    check the certificates of an agent again\n"
-        "  compare   a page with several runs beside each other"
-    )
-
-
-def train(words: list[str]) -> int:
-    """``sspl train``: compose a configuration, train, evaluate and report; or many of them.
-
-    Args:
-        words: ``key=value`` and options, or ``--help``.
-
-    Returns 0, or 1 where one of several runs failed. Raises ConfigError if an option, a key or a value is not valid;
-    before anything is computed. Source: paper, Algorithm 1.
-    """
+def _train(words: list[str]) -> int:
+    """Compose a configuration, train, evaluate and report; or many of them."""
     overrides, options = _options(words)
     if options.keys() & {"--launcher", "--jobs"} and "--multirun" not in options:
         raise ConfigError("expected --multirun with --launcher or --jobs, received none; one run needs neither")
@@ -149,7 +135,7 @@ def _help(overrides: Sequence[str]) -> str:
     rows = list(fields(compose(overrides)))
     width = max(len(key) for key, *_ in rows) + 2
     lines = [f"  {key:<{width}} {meaning} ({kind}, {'null' if value is None else value})" for key, kind, value, meaning in rows]
-    return TRAIN.format(envs="|".join(ENVS), presets="|".join(PRESETS)) + "\n".join(lines)
+    return _TRAIN.format(envs="|".join(ENVS), presets="|".join(PRESETS)) + "\n".join(lines)
 
 
 def _multirun(overrides: Sequence[str], options: dict[str, str]) -> int:
@@ -167,15 +153,8 @@ def _multirun(overrides: Sequence[str], options: dict[str, str]) -> int:
     return out.exit_code
 
 
-def evaluate(words: list[str]) -> int:
-    """``sspl evaluate``: measure an agent on fresh data.
-
-    Args:
-        words: name of a shipped agent or a run directory, and ``key=value`` for the fields of its evaluation.
-
-    Returns 0. Raises CheckpointError if there is no such agent, or its environment is not known; ConfigError if a key
-    or a value is not valid. Source: none.
-    """
+def _evaluate(words: list[str]) -> int:
+    """Measure an agent on fresh data."""
     parser = argparse.ArgumentParser(prog="sspl evaluate", description="Measure an agent on fresh data.", allow_abbrev=False)
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="fields of the evaluation, such as seed=7")
@@ -194,15 +173,10 @@ def evaluate(words: list[str]) -> int:
 
 
 def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: str = "cpu") -> Any:
-    """Measure a shipped agent or the agent of a run directory on its own environment.
+    """Measurements of a shipped agent or the agent of a run directory on its own environment.
 
-    Args:
-        name_or_path: as for ``torchrl_sspl.load``.
-        overrides: ``key=value`` for the fields of ``EvaluationConfig``.
-        device: device of the networks.
-
-    Returns the measurements. Raises CheckpointError if there is no such agent, or its environment is not known;
-    ConfigError if a key or a value is not valid. Source: none.
+    Overrides are ``key=value`` for the fields of ``EvaluationConfig``. Raises CheckpointError if there is no such
+    agent, or its environment is not known; ConfigError if a key or a value is not valid. Source: none.
     """
     from torchrl_sspl.configs.reader import EnvFactory, change, from_dict
     from torchrl_sspl.envs.base import SafetyEnv
@@ -233,15 +207,11 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
     return evaluate_episodes(agent, make_env, config.evaluation)
 
 
-def verify(words: list[str]) -> int:
-    """``sspl verify``: check the certificates of an agent again.
+def _verify(words: list[str]) -> int:
+    """Check the certificates of an agent again.
 
-    Args:
-        words: name of a shipped agent or a run directory, and options.
-
-    Returns 0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no certificate or
-    the file is none, 4 if the agent cannot be read, 5 if the time was too short. Raises CheckpointError if there is no
-    such agent. Source: none.
+    0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no certificate or the file is
+    none, 4 if the agent cannot be read, 5 if the time was too short.
     """
     parser = argparse.ArgumentParser(prog="sspl verify", description="Check the certificates of an agent again.")
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
@@ -254,14 +224,8 @@ def verify(words: list[str]) -> int:
     return int(verify_run(options.agent, measure=options.measure or None, seconds=options.seconds))
 
 
-def compare(words: list[str]) -> int:
-    """``sspl compare``: write a page that shows runs beside each other, and print their table.
-
-    Args:
-        words: directories of runs.
-
-    Returns 0. Raises CheckpointError if none of them is a run that has come to an end. Source: none.
-    """
+def _compare(words: list[str]) -> int:
+    """Write a page that shows runs beside each other, and print their table."""
     parser = argparse.ArgumentParser(prog="sspl compare", description="Runs beside each other, on one page.")
     parser.add_argument("runs", nargs="+", metavar="RUN", help="directories of runs; other files are passed over")
     parser.add_argument("--out", metavar="FILE", help="the page; default: comparison.html beside the runs")
@@ -274,7 +238,3 @@ def compare(words: list[str]) -> int:
     print(page.text_table(page.rows_of(runs)))
     print(f"comparison: {path}")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

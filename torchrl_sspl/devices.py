@@ -8,12 +8,9 @@ from torchrl_sspl.errors import ConfigError
 
 
 def usable_device(name: torch.device | str) -> torch.device:
-    """The device of a name, if this machine has it.
+    """The device of a name such as ``"cpu"``, ``"cuda"`` or ``"cuda:1"``, if this machine has it.
 
-    Args:
-        name: such as ``"cpu"``, ``"cuda"`` or ``"cuda:1"``.
-
-    Returns the device. Raises ConfigError if there is no such device here. Source: none.
+    Raises ConfigError if there is no such device here. Source: none.
 
     Example:
         >>> usable_device("cpu")

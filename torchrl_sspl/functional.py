@@ -21,11 +21,7 @@ Scalar = float | Tensor
 def safe_hinge(barrier: Tensor, safety_margin: Scalar) -> Tensor:
     r"""Hinge that is zero where a safe latent is inside by the margin, :math:`\max(0, B(z) + \psi)`.
 
-    Args:
-        barrier: ``(*batch, 1)``.
-        safety_margin: :math:`\psi`, in units of the barrier.
-
-    Returns ``(*batch, 1)``. Source: paper eq. (8), first term.
+    For B ``(*batch, 1)`` and :math:`\psi` in its units; returns ``(*batch, 1)``. Source: paper eq. (8), first term.
 
     Example:
         >>> safe_hinge(torch.tensor([[-1.0], [0.5]]), 0.25).flatten().tolist()
@@ -37,11 +33,7 @@ def safe_hinge(barrier: Tensor, safety_margin: Scalar) -> Tensor:
 def unsafe_hinge(barrier: Tensor, safety_margin: Scalar) -> Tensor:
     r"""Hinge that is zero where an unsafe latent is outside by the margin, :math:`\max(0, -B(z) + \psi)`.
 
-    Args:
-        barrier: ``(*batch, 1)``.
-        safety_margin: :math:`\psi`, in units of the barrier.
-
-    Returns ``(*batch, 1)``. Source: paper eq. (8), second term.
+    For B ``(*batch, 1)`` and :math:`\psi` in its units; returns ``(*batch, 1)``. Source: paper eq. (8), second term.
 
     Example:
         >>> unsafe_hinge(torch.tensor([[1.0], [-0.5]]), 0.25).flatten().tolist()
@@ -53,11 +45,8 @@ def unsafe_hinge(barrier: Tensor, safety_margin: Scalar) -> Tensor:
 def consistency_error(predicted: Tensor, target: Tensor) -> Tensor:
     r"""Squared error of a predicted latent, :math:`\|\bar z_{t+1} - d(z_t, u_t)\|_2^2`.
 
-    Args:
-        predicted: ``(*batch, p)``.
-        target: ``(*batch, p)``.
-
-    Returns ``(*batch, 1)``. Raises ShapeError if the shapes differ. Source: paper eq. (8), third term.
+    For latents ``(*batch, p)``; returns ``(*batch, 1)``. Raises ShapeError if the shapes differ. Source: paper eq. (8),
+    third term.
 
     Example:
         >>> consistency_error(torch.tensor([[3.0, 0.0]]), torch.tensor([[0.0, 4.0]]))
@@ -70,11 +59,7 @@ def consistency_error(predicted: Tensor, target: Tensor) -> Tensor:
 def dynamics_error(predicted: Tensor, actual: Tensor) -> Tensor:
     r"""Latent prediction error, :math:`\|E(o_{t+1}) - d(z_t, u_t)\|_2`; its maximum is the paper's delta.
 
-    Args:
-        predicted: ``(*batch, p)``.
-        actual: ``(*batch, p)``.
-
-    Returns ``(*batch,)``. Raises ShapeError if the shapes differ. Source: paper Theorem 2.
+    For latents ``(*batch, p)``; returns ``(*batch,)``. Raises ShapeError if the shapes differ. Source: paper Theorem 2.
 
     Example:
         >>> dynamics_error(torch.tensor([[3.0, 0.0]]), torch.tensor([[0.0, 4.0]]))
@@ -140,15 +125,10 @@ def synthesis_violation(
 
 
 def policy_deviation(action: Tensor, action_user: Tensor) -> Tensor:
-    r"""Distance to the user's action, :math:`\|\pi(z) - \pi_{user}\|_2`.
+    r"""Distance to the user's action, :math:`\|\pi(z) - \pi_{user}\|_2`; its gradient at zero distance is zero.
 
-    The gradient at zero distance is zero.
-
-    Args:
-        action: ``(*batch, m)``, physical units.
-        action_user: ``(*batch, m)``, physical units.
-
-    Returns ``(*batch, 1)``. Raises ShapeError if the shapes differ. Source: paper eq. (13).
+    For actions ``(*batch, m)``, physical units; returns ``(*batch, 1)``. Raises ShapeError if the shapes differ.
+    Source: paper eq. (13).
 
     Example:
         >>> policy_deviation(torch.tensor([[3.0, 4.0]]), torch.zeros(1, 2))
@@ -216,11 +196,9 @@ def lmi_matrix(
 def lmi_loss(matrix: Tensor) -> Tensor:
     r"""Log-determinant barrier of the cone, :math:`-\log\det M`, defined for positive definite M only.
 
-    Args:
-        matrix: symmetric ``(n, n)``.
-
-    Returns a scalar. Raises NotPositiveDefiniteError if M is not positive definite; the printed loss would go on with a
-    meaningless gradient. Source: paper eq. (9); deviation: the cone is checked, the sign of the loss decides nothing.
+    For a symmetric ``(n, n)``; returns a scalar. Raises NotPositiveDefiniteError if M is not positive definite; the
+    printed loss would go on with a meaningless gradient. Source: paper eq. (9); deviation: the cone is checked, the
+    sign of the loss decides nothing.
 
     Example:
         >>> round(float(lmi_loss(torch.diag(torch.tensor([2.0, 0.5])))), 6) == 0.0
@@ -236,13 +214,7 @@ def lmi_loss(matrix: Tensor) -> Tensor:
 
 
 class SafetyMargins(NamedTuple):
-    """Margin of each condition: q1 on S, q2 on U, q3 on the step.
-
-    Attributes:
-        q1: margin of B <= 0 on S.
-        q2: margin of B > 0 on U.
-        q3: margin of the condition on a step.
-    """
+    """Margin of each condition: q1 of B <= 0 on S, q2 of B > 0 on U, q3 of the condition on a step."""
 
     q1: float
     q2: float
@@ -283,12 +255,8 @@ def safety_margin(
 def dynamics_margin(lipschitz_bound: float, dynamics_error: float) -> float:
     r"""Margin that makes up for the error of the latent dynamics, :math:`\eta^* = L_B \delta`.
 
-    Args:
-        lipschitz_bound: :math:`L_B`.
-        dynamics_error: :math:`\delta`, latent units.
-
-    Returns the margin, units of the barrier. Source: paper Theorem 2; the same in both modes, what differs is the data
-    on which the error is measured.
+    For :math:`\delta` in latent units; returns units of the barrier. Source: paper Theorem 2; the same in both modes,
+    what differs is the data on which the error is measured.
 
     Example:
         >>> dynamics_margin(2.0, 0.25)

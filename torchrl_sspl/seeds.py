@@ -32,17 +32,13 @@ _MASK = 0xFFFF_FFFF
 def spawn(seed: int, purpose: str, index: int = 0) -> int:
     """Seed for one purpose of a run.
 
-    Two purposes or indices of one run never get the same seed: they are numbered, and the number is mixed into 32 bits by a
-    bijection. It has 32 bits because that is what ``torch.Generator`` keeps of a seed on the CPU. Different runs start from
-    different places, which :class:`numpy.random.SeedSequence` gives; between two of them a seed can be the same by a
-    chance of one in four thousand million, which :func:`used_before` finds.
+    Two purposes or indices of one run never get the same seed: they are numbered, and the number is mixed into 32 bits
+    by a bijection. It has 32 bits because that is what ``torch.Generator`` keeps of a seed on the CPU. Different runs
+    start from different places, which :class:`numpy.random.SeedSequence` gives; between two of them a seed can be the
+    same by a chance of one in four thousand million, which :func:`used_before` finds.
 
-    Args:
-        seed: seed of the run, not negative.
-        purpose: one of :data:`PURPOSES`.
-        index: number among those of the purpose, below 2^24.
-
-    Returns seed in [0, 2^32). Raises ConfigError if the purpose is not registered, or a number is out of range.
+    For a seed that is not negative, one of :data:`PURPOSES`, and the number among its own, below 2^24; returns a seed
+    in [0, 2^32). Raises ConfigError if the purpose is not registered, or a number is out of range.
     Source: none.
 
     Example:
@@ -64,13 +60,9 @@ def spawn(seed: int, purpose: str, index: int = 0) -> int:
 
 
 def used_before(seed: int, history: Iterable[int]) -> bool:
-    """Whether a generator with this seed would repeat one of earlier seeds.
+    """Whether a generator would repeat one of earlier seeds: they agree in the 32 bits that torch keeps on the CPU.
 
-    Args:
-        seed: the seed.
-        history: seeds that were used.
-
-    Returns whether one of them agrees in the 32 bits that ``torch.Generator`` keeps on the CPU. Source: none.
+    Source: none.
 
     Example:
         >>> used_before(1, [2**32 + 1]), used_before(1, [2])

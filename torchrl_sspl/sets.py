@@ -39,13 +39,9 @@ class Region:
     dim: int
 
     def contains(self, state: Tensor) -> Tensor:
-        """Whether states belong to the set.
+        """Whether states ``(*batch, dim)``, state units, belong to the set: bool ``(*batch,)``.
 
-        Args:
-            state: ``(*batch, dim)``, state units.
-
-        Returns bool ``(*batch,)``. Raises ShapeError if the last dimension is not ``dim``; NonFiniteError if a state is
-        NaN. Source: none.
+        Raises ShapeError if the last dimension is not ``dim``; NonFiniteError if a state is NaN.
 
         Example:
             >>> Box([0.0], [1.0]).contains(torch.tensor([[0.0], [1.0], [1.1]]))
@@ -54,14 +50,9 @@ class Region:
         raise NotImplementedError
 
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
-        """Random states of the set.
+        """``n`` random states of the set, ``(n, dim)``, float32, state units, on a device, as is the generator.
 
-        Args:
-            n: how many.
-            generator: random numbers, on ``device``.
-            device: where the states go.
-
-        Returns ``(n, dim)``, float32, state units. Raises EmptyRegionError if no state is found. Source: none.
+        Raises EmptyRegionError if no state is found.
 
         Example:
             >>> Box([0.0], [1.0]).sample(3, torch.Generator().manual_seed(0)).shape
@@ -94,9 +85,7 @@ class Box(Region):
         tensor([True, True, True, True])
     """
 
-    def __init__(
-        self, low: Sequence[float], high: Sequence[float], period: Sequence[float | None] | None = None
-    ) -> None:
+    def __init__(self, low: Sequence[float], high: Sequence[float], period: Sequence[float | None] | None = None) -> None:
         self.low, self.high = torch.as_tensor(low, dtype=torch.float32), torch.as_tensor(high, dtype=torch.float32)
         finite = bool(self.low.isfinite().all() & self.high.isfinite().all())
         if self.low.ndim != 1 or self.low.shape != self.high.shape or not finite or not bool((self.low < self.high).all()):
@@ -108,12 +97,7 @@ class Box(Region):
         self.period = torch.tensor(periods)
 
     def contains(self, state: Tensor) -> Tensor:
-        """Whether states lie in the box, borders included; arguments as for :meth:`Region.contains`.
-
-        Example:
-            >>> Box([0.0, 0.0], [1.0, 2.0]).contains(torch.tensor([[0.5, 2.0], [0.5, 2.1]]))
-            tensor([ True, False])
-        """
+        """Whether states lie in the box, borders included."""
         _check_states(state, self.dim)
         low, high, period = (t.to(state) for t in (self.low, self.high, self.period))
         inside = (state >= low) & (state <= high)
@@ -126,21 +110,12 @@ class Box(Region):
         return torch.where(period > 0, around, inside).all(-1)
 
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
-        """Uniform states of the box; arguments as for :meth:`Region.sample`.
-
-        Example:
-            >>> box = Box([0.0, 5.0], [1.0, 6.0])
-            >>> bool(box.contains(box.sample(100)).all())
-            True
-        """
+        """Uniform states of the box."""
         u = torch.rand(n, self.dim, generator=generator, device=device)
         return self.low.to(u) + u * (self.high - self.low).to(u)
 
     def grid(self, n: int | Sequence[int]) -> Tensor:
-        """Regular grid over the box, corners included.
-
-        Args:
-            n: points per component, one number or one for each.
+        """Regular grid over the box, corners included, n points per component: one number, or one for each.
 
         Returns ``(prod(n), dim)``, float32, last component fastest. Raises ConfigError if the number of sizes is not
         ``dim``, or one is below 1. Source: none.
@@ -157,11 +132,7 @@ class Box(Region):
 
 
 class Difference(Region):
-    r"""States of one set that are not in another, :math:`A \setminus B`; also ``a - b``.
-
-    Args:
-        a: the set A.
-        b: the set B, of the same dimension.
+    r"""States of one set that are not in another of the same dimension, :math:`A \setminus B`; also ``a - b``.
 
     Raises ShapeError if the dimensions differ. Source: paper Section V (unsafe: the space without a box).
 
@@ -175,24 +146,11 @@ class Difference(Region):
         self.a, self.b, self.dim = a, b, _common_dim(a, b)
 
     def contains(self, state: Tensor) -> Tensor:
-        """Whether states are in A and not in B; arguments as for :meth:`Region.contains`.
-
-        Example:
-            >>> (Box([0.0], [2.0]) - Box([0.0], [1.0])).contains(torch.tensor([[1.0], [1.5]]))
-            tensor([False,  True])
-        """
+        """Whether states are in A and not in B."""
         return self.a.contains(state) & ~self.b.contains(state)
 
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
-        """Samples of A without those in B; arguments as for :meth:`Region.sample`.
-
-        Raises EmptyRegionError if (almost) every sample of A is in B.
-
-        Example:
-            >>> ring = Box([-2.0], [2.0]) - Box([-1.0], [1.0])
-            >>> bool((ring.sample(100).abs() > 1.0).all())
-            True
-        """
+        """Samples of A without those in B; raises EmptyRegionError if (almost) every sample of A is in B."""
         parts, found = [], 0
         for _ in range(_ATTEMPTS):
             x = self.a.sample(max(2 * n, 64), generator, device)
@@ -208,10 +166,7 @@ class Difference(Region):
 
 
 class Union(Region):
-    r"""States of any of several sets, :math:`\bigcup_i A_i`; also ``a | b``.
-
-    Args:
-        *parts: the sets, of the same dimension.
+    r"""States of any of several sets of the same dimension, :math:`\bigcup_i A_i`; also ``a | b``.
 
     Raises ConfigError if there are none; ShapeError if the dimensions differ. Source: none.
 
@@ -226,39 +181,25 @@ class Union(Region):
         self.parts, self.dim = parts, _common_dim(*parts)
 
     def contains(self, state: Tensor) -> Tensor:
-        """Whether states are in any of the sets; arguments as for :meth:`Region.contains`.
-
-        Example:
-            >>> Union(Box([0.0], [1.0])).contains(torch.tensor([0.5]))
-            tensor(True)
-        """
+        """Whether states are in any of the sets."""
         return torch.stack([p.contains(state) for p in self.parts]).any(0)
 
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
-        """Samples in equal shares from the parts, grouped by part; arguments as for :meth:`Region.sample`.
+        """Samples in equal shares from the parts, grouped by part."""
+        return self._by_part(torch.randint(len(self.parts), (n,), generator=generator, device=device), generator, device)
 
-        Example:
-            >>> union = Box([0.0], [1.0]) | Box([2.0], [3.0])
-            >>> bool(union.contains(union.sample(100)).all())
-            True
-        """
-        which = torch.randint(len(self.parts), (n,), generator=generator, device=device)
+    def _by_part(self, which: Tensor, generator: torch.Generator | None, device: torch.device | str | None) -> Tensor:
         return torch.cat([p.sample(int((which == k).sum()), generator, device) for k, p in enumerate(self.parts)])
 
 
 class Mixture(Union):
-    """Union of regions from which states are drawn in given shares.
-
-    Args:
-        parts (sequence of Region): regions of the same dimension.
-        shares (sequence of float): how often each is drawn from, not negative, not all zero.
+    """Union of regions from which states are drawn in given shares, not negative and not all zero.
 
     Raises ConfigError if the shares do not fit the parts. Source: none.
 
     Example:
-        >>> left, right = Box([-1.0], [0.0]), Box([1.0], [2.0])
-        >>> drawn = Mixture([left, right], [1, 3]).sample(400, torch.Generator().manual_seed(0))
-        >>> 0.7 < float((drawn > 0).float().mean()) < 0.8
+        >>> mixture = Mixture([Box([-1.0], [0.0]), Box([1.0], [2.0])], [1, 3])
+        >>> 0.7 < float((mixture.sample(400, torch.Generator().manual_seed(0)) > 0).float().mean()) < 0.8
         True
     """
 
@@ -270,18 +211,13 @@ class Mixture(Union):
         self.shares = torch.tensor([share for _, share in kept])
 
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
-        """Samples in the given shares, grouped by part; arguments as for :meth:`Region.sample`."""
+        """Samples in the given shares, grouped by part."""
         which = torch.multinomial(self.shares.to(device or "cpu"), n, True, generator=generator) if n else torch.zeros(0)
-        return torch.cat([p.sample(int((which == k).sum()), generator, device) for k, p in enumerate(self.parts)])
+        return self._by_part(which, generator, device)
 
 
 def label(state: Tensor, safe: Region, unsafe: Region) -> Tensor:
-    """Region codes of states: 0 unlabelled, 1 safe, 2 unsafe (unsafe wins where both claim a state).
-
-    Args:
-        state: ``(*batch, dim)``, state units.
-        safe: the set S.
-        unsafe: the set U.
+    """Region codes of states ``(*batch, dim)``: 0 unlabelled, 1 safe, 2 unsafe (which wins where both claim a state).
 
     Returns int64 ``(*batch, 1)``. Raises ShapeError if the last dimension is not that of the sets; NonFiniteError if a
     state is NaN. Source: paper Section III (the labelled data).
@@ -295,12 +231,7 @@ def label(state: Tensor, safe: Region, unsafe: Region) -> Tensor:
 
 
 def check_disjoint(safe: Region, unsafe: Region, n: int = 4096) -> None:
-    """Raises if a sample of one set belongs to the other: a check by samples, not a proof.
-
-    Args:
-        safe: the set S.
-        unsafe: the set U.
-        n: samples of each set.
+    """Raises if one of n samples of one set belongs to the other: a check by samples, not a proof.
 
     Raises OverlapError if the sets share a sample; EmptyRegionError if a set has (almost) no volume. Source: none.
 

@@ -7,7 +7,6 @@ import torch
 from torch import nn
 
 from torchrl_sspl.data import collect_random
-from torchrl_sspl.data.encoding import encode_transitions
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.modules import FrameEncoder, Policy
 from torchrl_sspl.sets import SAFE, UNSAFE, Mixture
@@ -92,7 +91,7 @@ def test_transitions_are_those_of_the_environment_and_its_labels(encoder):
     from torchrl_sspl.seeds import spawn
 
     store = collect_random(env, 40, seed=spawn(3, "rounds", 2000), steps=4, region=env.state_space)
-    expected = encode_transitions(found._encode, store)
+    expected = found._encode(store, torch.arange(40))
     assert same(drawn, expected)
     assert torch.equal(drawn["action"], store.get(slice(None))["action"])
 
@@ -143,7 +142,7 @@ def test_without_a_store_nothing_is_stored_and_with_one_it_is_counted(encoder):
     store = collect_random(make([8]), 80, seed=0, steps=4)
     found = build(encoder, store=store)
     kept = found.stored(1000)
-    assert same(kept, encode_transitions(found._encode, store, torch.arange(80)))
+    assert same(kept, found._encode(store, torch.arange(80)))
     assert found.budget["transitions"] == 80
     few = found.stored(20)
     assert len(few["latent"]) == 20

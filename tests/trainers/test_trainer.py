@@ -25,7 +25,7 @@ from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
 from torchrl_sspl.trainers.hooks import EveryHook, MarginHook
-from torchrl_sspl.trainers.stepper import SSPLStepper, learnable
+from torchrl_sspl.trainers.stepper import SSPLStepper
 from torchrl_sspl.trainers.trainer import SSPLTrainer
 
 # TorchRL announces changes of its own trainer, collector and checkpoints.
@@ -325,8 +325,3 @@ def test_every_batch_leaves_a_line_in_the_log_and_a_loss_that_is_not_finite_stop
         next(trainer.loss_module.parameters()).fill_(float("nan"))
     with pytest.raises(ConfigError, match="expected finite losses"):
         trainer.train()
-
-
-def test_shared_parameters_are_listed_once() -> None:
-    layer = torch.nn.Linear(2, 1)
-    assert learnable([layer, torch.nn.Sequential(layer)]) == list(layer.parameters())

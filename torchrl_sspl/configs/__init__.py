@@ -15,18 +15,6 @@ from torchrl_sspl.configs.schema import (
 )
 
 __all__ = [
-    "BufferConfig",
-    "CollectorConfig",
-    "Config",
-    "EnvFactory",
-    "EvaluationConfig",
-    "LoggerConfig",
-    "LossConfig",
-    "NetworkConfig",
-    "OptimConfig",
-    "SynthesisConfig",
-    "TrainerConfig",
-    "compose",
-    "load",
-    "save",
-]
+    "BufferConfig", "CollectorConfig", "Config", "EnvFactory", "EvaluationConfig", "LoggerConfig", "LossConfig",
+    "NetworkConfig", "OptimConfig", "SynthesisConfig", "TrainerConfig", "compose", "load", "save",
+]  # fmt: skip

@@ -17,11 +17,7 @@ CONFIG_NAME = "sspl"
 
 @dataclass
 class HydraConfig(Config):
-    """The configuration with a list of defaults, as Hydra wants it; see ``Config``.
-
-    Attributes:
-        defaults: the files in their order.
-    """
+    """The configuration with a list of files in their order, as Hydra wants it; see ``Config``."""
 
     defaults: list[Any] = field(
         default_factory=lambda: [
@@ -56,13 +52,9 @@ def register() -> None:
 
 
 def to_config(node: Any) -> Config:
-    """The configuration that Hydra hands to a main function, as dataclasses.
+    """The configuration that Hydra hands to a main function, checked, as dataclasses.
 
-    Args:
-        node: the composed configuration.
-
-    Returns the configuration, checked. Raises ConfigError if a key is unknown, or values do not go together.
-    Source: none.
+    Raises ConfigError if a key is unknown, or values do not go together. Source: none.
     """
     try:
         values = OmegaConf.to_container(node, resolve=True)

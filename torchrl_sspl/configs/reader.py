@@ -31,8 +31,8 @@ ENVS = tuple(sorted(p.stem for p in (FOLDER / "env").glob("*.yaml") if "." not i
 _SHORT = {"logger": "logger.kind", "loss": "loss.preset"}
 _GIVEN = ("batch_size", "seed", "device", "self")  # arguments of an environment that the trainer sets
 _NOTHING = ("none", "null")
-_HINTS = {section: get_type_hints(kind) for section, kind in get_type_hints(Config).items() if dataclasses.is_dataclass(kind)}
 _TOP = get_type_hints(Config)
+_HINTS = {section: get_type_hints(kind) for section, kind in _TOP.items() if dataclasses.is_dataclass(kind)}
 
 
 def compose(overrides: Sequence[str] = (), **defaults: Any) -> Config:
@@ -70,12 +70,9 @@ def compose(overrides: Sequence[str] = (), **defaults: Any) -> Config:
 
 
 def parse(overrides: Sequence[str]) -> dict[str, str]:
-    """Keys and values, as text, of ``key=value`` strings; the last one wins.
+    """Values, as text, by key of ``key=value`` strings; the last one wins.
 
-    Args:
-        overrides: the strings.
-
-    Returns text by key. Raises ConfigError if ``overrides`` is not a list of such strings. Source: none.
+    Raises ConfigError if ``overrides`` is not a list of such strings. Source: none.
 
     Example:
         >>> parse(["seed=3", "logger=none"])
@@ -98,13 +95,9 @@ def parse(overrides: Sequence[str]) -> dict[str, str]:
 
 
 def from_dict(values: Mapping[str, Any]) -> Config:
-    """Configuration from a nested dictionary, such as :meth:`Config.to_dict` returns.
+    """Checked configuration from a nested dictionary of all values, or of those that differ from the defaults.
 
-    Args:
-        values: what differs from the dataclasses' defaults, or everything.
-
-    Returns the configuration, checked. Raises ConfigError if a key is unknown or a value has the wrong type.
-    Source: none.
+    Raises ConfigError if a key is unknown or a value has the wrong type. Source: none.
 
     Example:
         >>> from_dict({"network": {"latent_dim": 4}}).network.latent_dim
@@ -256,14 +249,7 @@ def _file(path: Path) -> dict[str, Any]:
 
 
 def save(config: Config, path: str | Path) -> Path:
-    """Write a configuration, as YAML or JSON by the ending of the file.
-
-    Args:
-        config: the configuration.
-        path: the file; it is replaced in one step.
-
-    Returns the file. Source: none.
-    """
+    """Write a configuration, as YAML or JSON by the ending of the file, which is replaced in one step and returned."""
     path = Path(path)
     body = config.to_dict()
     text = json.dumps(body, indent=1) + "\n" if path.suffix == ".json" else OmegaConf.to_yaml(OmegaConf.create(body))
@@ -274,12 +260,9 @@ def save(config: Config, path: str | Path) -> Path:
 
 
 def load(path: str | Path) -> Config:
-    """Read a configuration that :func:`save` has written.
+    """Read and check a configuration that :func:`save` has written.
 
-    Args:
-        path: the file.
-
-    Returns the configuration, checked. Raises ConfigError if the file cannot be read, a key is unknown or a value has
+    Raises ConfigError if the file cannot be read, a key is unknown or a value has
     the wrong type. Source: none.
 
     Example:
@@ -292,13 +275,7 @@ def load(path: str | Path) -> Config:
 
 
 def change(config: Config, overrides: Sequence[str]) -> Config:
-    """A configuration with changes.
-
-    Args:
-        config: the configuration, which stays as it is.
-        overrides: ``key=value`` strings.
-
-    Returns the changed one, checked. Raises ConfigError as for :func:`compose`. Source: none.
+    """Another configuration with ``key=value`` changes, checked as :func:`compose` does. Source: none.
 
     Example:
         >>> change(compose(["seed=3"]), ["evaluation.episodes=5"]).evaluation.episodes
@@ -308,17 +285,7 @@ def change(config: Config, overrides: Sequence[str]) -> Config:
 
 
 def valid_keys(config: Config) -> list[str]:
-    """All keys of a configuration, those of its environment by what that takes.
-
-    Args:
-        config: the configuration.
-
-    Returns keys such as ``"network.latent_dim"``. Source: none.
-
-    Example:
-        >>> "env.image_size" in valid_keys(compose(["env=pendulum"]))
-        True
-    """
+    """All keys of a configuration, such as ``"network.latent_dim"``, those of its environment by what that takes."""
     keys = [*(name for name in _TOP if name not in _HINTS and name != "env"), "env._target_"]
     keys += [f"{section}.{name}" for section, hints in _HINTS.items() for name in hints]
     try:
@@ -329,22 +296,13 @@ def valid_keys(config: Config) -> list[str]:
 
 
 def fields(config: Config | None = None) -> Iterator[tuple[str, str, Any, str]]:
-    """Key, type, value and meaning of every field.
-
-    Args:
-        config: whose values and environment are shown; default: those of no system.
-
-    Yields:
-        ``(key, type, value, meaning)``.
-
-    Source: none.
+    """Key, type, value and meaning of every field; without a configuration, of no system. Source: none.
 
     Example:
         >>> next(fields())[:3]
         ('preset', 'str', 'sound')
     """
     config = config or Config()
-    meaning = attribute_texts(Config)
     for item in dataclasses.fields(config):
         value = getattr(config, item.name)
         if item.name == "env":
@@ -356,11 +314,10 @@ def fields(config: Config | None = None) -> Iterator[tuple[str, str, Any, str]]:
                 if name != "**":
                     yield f"env.{name}", _hint(kind), value.get(name, default), texts.get(name, "")
         elif dataclasses.is_dataclass(value):
-            texts = attribute_texts(type(value))
             for inner in dataclasses.fields(value):
-                yield f"{item.name}.{inner.name}", _hint(inner.type), getattr(value, inner.name), texts.get(inner.name, "")
+                yield f"{item.name}.{inner.name}", _hint(inner.type), getattr(value, inner.name), inner.metadata["meaning"]
         else:
-            yield item.name, _hint(item.type), value, meaning.get(item.name, "")
+            yield item.name, _hint(item.type), value, item.metadata["meaning"]
 
 
 def _hint(kind: Any) -> str:
@@ -368,17 +325,7 @@ def _hint(kind: Any) -> str:
 
 
 def attribute_texts(kind: Any) -> dict[str, str]:
-    """Meaning of attributes or arguments, from the section "Attributes" or "Args" of a docstring.
-
-    Args:
-        kind: documented class or function.
-
-    Returns text by name. Source: none.
-
-    Example:
-        >>> attribute_texts(Config)["out_dir"]
-        'directory of the run.'
-    """
+    """Meaning of attributes or arguments by name, from the section "Attributes" or "Args" of a docstring."""
     texts: dict[str, str] = {}
     section = re.split(r"^(?:Attributes|Args):\n", inspect.getdoc(kind) or "", maxsplit=1, flags=re.MULTILINE)
     names: list[str] = []
@@ -394,12 +341,9 @@ def attribute_texts(kind: Any) -> dict[str, str]:
 
 
 def resolve(path: str) -> Any:
-    """What an import path names.
+    """What ``"package.module:name"`` or ``"package.module.name"`` names; the working directory is searched too.
 
-    Args:
-        path: ``"package.module:name"`` or ``"package.module.name"``; the working directory is searched too.
-
-    Returns the object. Raises ConfigError if there is no such module, or no such name in it. Source: none.
+    Raises ConfigError if there is no such module, or no such name in it. Source: none.
 
     Example:
         >>> resolve("torchrl_sspl.sets:SAFE")
@@ -471,10 +415,7 @@ def _check_env(env: Any) -> None:
 
 
 class EnvFactory:
-    """Makes the environments of a configuration, here or in another process.
-
-    Args:
-        env: section ``env`` of a configuration: an import path ``_target_``, and its arguments.
+    """Makes the environments of a section ``env``, an import path ``_target_`` and its arguments, here or elsewhere.
 
     Raises ConfigError if the target cannot be imported, or does not take these arguments. Source: none.
 
@@ -562,17 +503,6 @@ class _Make:
 
 
 __all__ = [
-    "ENVS",
-    "EnvFactory",
-    "attribute_texts",
-    "change",
-    "compose",
-    "fields",
-    "from_dict",
-    "gymnasium_env",
-    "load",
-    "parse",
-    "resolve",
-    "save",
-    "valid_keys",
-]
+    "ENVS", "EnvFactory", "attribute_texts", "change", "compose", "fields", "from_dict", "gymnasium_env", "load", "parse",
+    "resolve", "save", "valid_keys",
+]  # fmt: skip

@@ -25,20 +25,17 @@ _BATCH = 2048  # transitions at a time; an episode that a batch cuts in two cost
 
 
 class RandomActions(TensorDictModuleBase):
-    """Policy that draws actions uniformly from the action bounds, with a random generator of its own.
+    """Policy that draws actions uniformly from the bounds of an environment, with a random generator of its own.
 
-    Args:
-        env (EnvBase): gives the bounded action spec.
-        seed (int, optional): seed of the generator. Default None: different every time.
+    Without a seed it draws others every time. Source: paper Section IV-D.
     """
 
     def __init__(self, env: EnvBase, seed: int | None = None) -> None:
         super().__init__()
         self.in_keys: list[str] = []
         self.out_keys = ["action"]
-        spec = env.action_spec_unbatched
-        self._low, self._high = spec.space.low, spec.space.high
-        self._seed = seed
+        space = env.action_spec_unbatched.space
+        self._low, self._high, self._seed = space.low, space.high, seed
         self._generator: torch.Generator | None = None
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -107,46 +104,20 @@ class ExploringPolicy(TensorDictModuleBase):
 
 
 def collect_random(
-    env: EnvBase | Callable[[], EnvBase],
-    n: int,
-    *,
-    seed: int | None = None,
-    steps: int | None = None,
-    region: Region | None = None,
-    store: TransitionStore | None = None,
-    keep_state: bool = False,
-    **collector: Any,
+    env: EnvBase | Callable[[], EnvBase], n: int, *, seed: int | None = None, **options: Any
 ) -> TransitionStore:
-    """Collect n transitions under uniformly random actions.
+    """Collect n transitions under uniformly random actions; the arguments are those of :func:`collect_rollouts`.
 
-    Args:
-        env: environment, or a function that makes one (required by backends with other processes).
-        n (int): number of transitions.
-        seed (int, optional): seed of states and actions; with the direct backend the result is then the same
-            every time. Default None: not seeded.
-        steps (int, optional): longest episode; 1 gives independent transitions. Default None: until the
-            environment ends it.
-        region (Region, optional): set from which episodes start, such as ``env.safe_set``. Default the
-            environment's ``initial_set``, all of the state space.
-        store (TransitionStore, optional): store to add to. Default a new one of capacity n.
-        keep_state (bool): keep true states in a new store, for evaluation. Default False.
-        **collector: arguments of ``torchrl.collectors.Collector``, such as ``backend``, ``num_collectors``,
-            ``frames_per_batch``. Default ``backend="direct"``.
-
-    Returns the store with n more transitions. Raises ConfigError if ``n`` or ``steps`` is not positive, or ``region``
-    is given with a function. Source: paper, Section IV-D (warm start on uniform random actions). Deviation: none.
+    Source: paper, Section IV-D (warm start on uniform random actions). Deviation: none.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
-        >>> store = collect_random(PendulumEnv(batch_size=[8]), 100, seed=0)
-        >>> len(store)
+        >>> len(collect_random(PendulumEnv(batch_size=[8]), 100, seed=0))
         100
     """
     probe = env if isinstance(env, EnvBase) else env()
     policy = RandomActions(probe, None if seed is None else seed + 1)
-    return collect_rollouts(
-        env, policy, n, seed=seed, steps=steps, region=region, store=store, keep_state=keep_state, **collector
-    )
+    return collect_rollouts(env, policy, n, seed=seed, **options)
 
 
 def collect_rollouts(
@@ -161,19 +132,26 @@ def collect_rollouts(
     keep_state: bool = False,
     **collector: Any,
 ) -> TransitionStore:
-    """Collect n transitions under a policy; the arguments are those of ``collect_random``.
+    """Collect n transitions under a policy.
 
     Args:
-        policy: tensordict module or callable that writes ``"action"``; let it write nothing else
-            (``selected_out_keys=["action"]``), what it writes is carried along.
+        env: environment, or a function that makes one (required by backends with other processes).
+        policy: writes ``"action"``; let it write nothing else (``selected_out_keys=["action"]``), it is carried along.
+        n: number of transitions.
+        seed: seed of states and actions; with the direct backend the result is then the same every time.
+        steps: longest episode; 1 gives independent transitions. Default: until the environment ends it.
+        region: set from which episodes start, such as ``env.safe_set``. Default: the environment's ``initial_set``.
+        store: store to add to. Default: a new one of capacity n.
+        keep_state: keep true states in a new store, for evaluation.
+        **collector: arguments of ``torchrl.collectors.Collector``, such as ``backend`` (``"direct"``),
+            ``num_collectors``.
 
     Returns the store with n more transitions. Raises ConfigError if ``n`` or ``steps`` is not positive, or ``region``
     is given with a function. Source: Algorithm 1 of the paper (rollouts of the policy join D). Deviation: none.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
-        >>> still = lambda tensordict: tensordict.set("action", torch.zeros(*tensordict.shape, 1))
-        >>> env = PendulumEnv(batch_size=[8])
+        >>> still, env = lambda rows: rows.set("action", torch.zeros(*rows.shape, 1)), PendulumEnv(batch_size=[8])
         >>> len(collect_rollouts(env, still, 40, seed=0, steps=10, region=env.safe_set))
         40
     """
@@ -192,14 +170,9 @@ def collect_rollouts(
         options.setdefault("return_same_td", True)  # what is collected is copied into the store at once
     with _starting_in(env, region):
         source = Collector(
-            env,
-            policy,
-            total_frames=-1,
-            max_frames_per_traj=steps,
-            auto_register_policy_transforms=False,
-            trust_policy=True,
-            **options,
-        )
+            env, policy, total_frames=-1, max_frames_per_traj=steps, auto_register_policy_transforms=False,
+            trust_policy=True, **options,
+        )  # fmt: skip
         try:
             if seed is not None and not isinstance(env, EnvBase):
                 source.set_seed(seed)
@@ -233,8 +206,8 @@ def make_collector(
     """A TorchRL collector in this process, in others of this machine, or on a Ray cluster.
 
     Batches have the same size and the same layout in all three. Environments live on the CPU; every batch begins with
-    resets, so that nothing depends on where a worker had stopped. With ``"process"`` and ``"ray"`` the workers hold copies
-    of the policy, which ``update_policy_weights_`` renews (``SSPLTrainer`` does so after every batch).
+    resets, so that nothing depends on where a worker had stopped. With ``"process"`` and ``"ray"`` the workers hold
+    copies of the policy, which ``update_policy_weights_`` renews (``SSPLTrainer`` does so after every batch).
 
     Args:
         make_env: ``(seed=...) -> environment``; it has to be picklable for other processes.
@@ -268,13 +241,9 @@ def make_collector(
             f"collector.frames_per_batch: expected a multiple of the {workers} workers, received {frames_per_batch}."
         )
     options: dict[str, Any] = {
-        "frames_per_batch": frames_per_batch,
-        "total_frames": total_frames,
-        "init_random_frames": init_random_frames,
-        "max_frames_per_traj": max_frames_per_traj,
-        "reset_at_each_iter": True,
-        "trust_policy": True,
-    }
+        "frames_per_batch": frames_per_batch, "total_frames": total_frames, "init_random_frames": init_random_frames,
+        "max_frames_per_traj": max_frames_per_traj, "reset_at_each_iter": True, "trust_policy": True,
+    }  # fmt: skip
     base = 0 if seed is None else seed
     makers = [functools.partial(make_env, seed=base + 7919 * k) for k in range(workers)]
     if backend == "sync":

@@ -24,35 +24,29 @@ _NAMES = {UNLABELLED: "unlabelled", SAFE: "safe", UNSAFE: "unsafe"}
 class TransitionStore(Storage):
     """Labelled transitions (o_t, u_t, o_{t+1}) in which every frame is stored once, as uint8.
 
-    An observation is a pair of frames, so a transition refers to three, (t-1, t, t+1), and the next one of
-    the same episode shares two of them. The store recognises consecutive transitions by comparing their
-    pixels, keeps triples of frame numbers, and hands out the three frames together, so that each can be
-    encoded once.
+    An observation is a pair of frames, so a transition refers to three, (t-1, t, t+1), and the next one of the same
+    episode shares two of them. The store recognises consecutive transitions by comparing their pixels, keeps triples of
+    frame numbers, and hands out the three frames together, so that each can be encoded once. It is a TorchRL
+    ``Storage``; ``replay_buffer`` puts it into a ``TensorDictReplayBuffer`` with stratified batches, for TorchRL's
+    trainers and collectors. It also works by itself (``extend``, ``sample``). When it is full, the oldest transitions
+    make room.
 
-    It is a TorchRL ``Storage``; ``replay_buffer`` puts it into a ``TensorDictReplayBuffer`` with stratified
-    batches, for TorchRL's trainers and collectors. It also works by itself (``extend``, ``sample``). When
-    it is full, the oldest transitions make room.
-
-    What is read from a tensordict that is written: ``"pixels"`` and ``("next", "pixels")`` uint8 ``(n, 6,
-    H, W)``, ``"action"``, ``"region"``, and where present ``("next", "region")``, ``("next",
-    "terminated")`` and, with ``keep_state``, ``"state"`` and ``("next", "state")``.
-
-    What comes out: ``"frames"`` uint8 ``(n, 3, 3, H, W)`` (time, RGB, height, width), ``"action"``,
-    ``"region"`` int64 ``(n, 1)``, ``("next", "region")``, ``("next", "terminated")``; with ``pixel_views``
-    also ``"pixels"`` and ``("next", "pixels")``, which share the memory of ``"frames"``; with
-    ``keep_state`` also ``("info", "state")`` and ``("info", "next_state")``, which no loss reads.
+    What is read from a tensordict that is written: ``"pixels"`` and ``("next", "pixels")`` uint8 ``(n, 6, H, W)``,
+    ``"action"``, ``"region"``, and where present ``("next", "region")``, ``("next", "terminated")`` and, with
+    ``keep_state``, ``"state"`` and ``("next", "state")``. What comes out: ``"frames"`` uint8 ``(n, 3, 3, H, W)`` (time,
+    RGB, height, width), ``"action"``, ``"region"`` int64 ``(n, 1)``, ``("next", "region")``, ``("next",
+    "terminated")``; with ``pixel_views`` also ``"pixels"`` and ``("next", "pixels")``, which share the memory of
+    ``"frames"``; with ``keep_state`` also ``("info", "state")`` and ``("info", "next_state")``, which no loss reads.
 
     Args:
-        capacity (int): largest number of transitions.
-        pixel_views (bool): hand out the observations beside the frames. Default False.
-        keep_state (bool): keep the true states, for evaluation. Default False.
+        capacity: largest number of transitions.
+        pixel_views: hand out the observations beside the frames.
+        keep_state: keep the true states, for evaluation.
 
     Raises ConfigError if ``capacity`` is not a positive integer. Source: the data sets D, S, U of the paper (Section
     IV): S and U are the labelled part of D, not copies.
 
     Example:
-        >>> import torch
-        >>> from tensordict import TensorDict
         >>> video = torch.randint(255, (12, 3, 8, 8), dtype=torch.uint8)
         >>> pixels = torch.cat([video[:-1], video[1:]], dim=1)
         >>> store = TransitionStore(100)
@@ -76,8 +70,6 @@ class TransitionStore(Storage):
         self._columns: dict[str, Tensor] = {}
         self._by_region: dict[int | None, Tensor] = {}
         self._empty()
-
-    # -- sizes -----------------------------------------------------------------------------------------
 
     def __len__(self) -> int:
         return self._len
@@ -115,8 +107,6 @@ class TransitionStore(Storage):
             )
         return found
 
-    # -- writing ---------------------------------------------------------------------------------------
-
     def extend(self, data: TensorDictBase) -> Tensor:
         """Add transitions ``(*batch,)``, time last; the oldest make room. Returns positions."""
         data = data.reshape(-1)
@@ -147,8 +137,7 @@ class TransitionStore(Storage):
         columns["triple"] = self._store_frames(now, then)
         for name, rows in columns.items():
             if name not in self._columns:
-                missing = -1 if name == "triple" else 0
-                self._columns[name] = torch.full((self.max_size, *rows.shape[1:]), missing, dtype=rows.dtype)
+                self._columns[name] = _column(name, rows, self.max_size)
             self._columns[name][index] = rows
         self._len = max(self._len, int(index.max()) + 1)
         self._by_region = {}
@@ -186,8 +175,6 @@ class TransitionStore(Storage):
             rows["state"], rows["next_state"] = state.reshape(n, -1), following.reshape(n, -1)
         return {name: value.detach().cpu() for name, value in rows.items()}
 
-    # -- reading ---------------------------------------------------------------------------------------
-
     def get(self, index: Any) -> TensorDict:
         """Transitions at given positions: an integer, a slice, or an integer tensor."""
         single = isinstance(index, int) or (isinstance(index, Tensor) and index.ndim == 0)
@@ -197,13 +184,9 @@ class TransitionStore(Storage):
         column = {name: values[rows] for name, values in self._columns.items()}
         frames = self._bank.read(column["triple"].reshape(-1))
         frames = frames.reshape(rows.numel(), 3, *frames.shape[1:])
+        following = {"region": column["next_region"], "terminated": column["terminated"]}
         out = TensorDict(
-            {
-                "frames": frames,
-                "action": column["action"],
-                "region": column["region"],
-                "next": {"region": column["next_region"], "terminated": column["terminated"]},
-            },
+            {"frames": frames, "action": column["action"], "region": column["region"], "next": following},
             batch_size=[rows.numel()],
         )
         if self.pixel_views:
@@ -221,30 +204,21 @@ class TransitionStore(Storage):
 
         Raises EmptyRegionError if a set from which a positive share is wanted is empty.
         """
-        return self.get(stratified_indices(self, n, safe, unsafe, generator))
+        return self.get(_stratified(self, n, safe, unsafe, generator))
 
     def replay_buffer(
         self, batch_size: int, *, safe: float = 0.125, unsafe: float = 0.125, **buffer: Any
     ) -> TensorDictReplayBuffer:
-        """This store as a TorchRL replay buffer with stratified batches; see ``RegionSampler``.
+        """This store as a TorchRL replay buffer with stratified batches, see ``RegionSampler``.
 
-        Args:
-            batch_size (int): transitions per batch.
-            safe, unsafe (float): shares of S and U in a batch. **buffer: arguments of
-                ``TensorDictReplayBuffer``, such as ``prefetch`` or ``generator``.
+        Further arguments are those of ``TensorDictReplayBuffer``, such as ``prefetch`` or ``generator``.
         """
         made = TensorDictReplayBuffer(
-            storage=self,
-            sampler=RegionSampler(safe, unsafe),
-            writer=RoundRobinWriter(),
-            collate_fn=_as_it_is,
-            batch_size=batch_size,
-            **buffer,
-        )
+            storage=self, sampler=RegionSampler(safe, unsafe), writer=RoundRobinWriter(), collate_fn=_as_it_is,
+            batch_size=batch_size, **buffer,
+        )  # fmt: skip
         made.writer._cursor = self._cursor  # go on behind what the store holds already
         return made
-
-    # -- saving ----------------------------------------------------------------------------------------
 
     def state_dict(self) -> dict[str, Any]:
         """All transitions and frames as tensors, frames without gaps; see ``load_state_dict``."""
@@ -267,13 +241,9 @@ class TransitionStore(Storage):
             slots = self._bank.reserve(state_dict["frames"].shape[0], state_dict["frames"].shape[2:])
             self._bank.write(slots, state_dict["frames"])
             for name, values in state_dict.items():
-                if name in ("_meta", "frames"):
-                    continue
-                values = slots[values] if name == "triple" else values
-                missing = -1 if name == "triple" else 0
-                column = torch.full((self.max_size, *values.shape[1:]), missing, dtype=values.dtype)
-                column[: self._len] = values
-                self._columns[name] = column
+                if name not in ("_meta", "frames"):
+                    self._columns[name] = _column(name, values, self.max_size)
+                    self._columns[name][: self._len] = slots[values] if name == "triple" else values
             self._bank.hold(self._columns["triple"][: self._len], +1)
         self._bump_mutation_revision()
 
@@ -316,6 +286,11 @@ class TransitionStore(Storage):
         return (index >= 0) & (index < self._len)
 
 
+def _column(name: str, rows: Tensor, size: int) -> Tensor:
+    """Room for a column of the store whose rows are like these."""
+    return torch.full((size, *rows.shape[1:]), -1 if name == "triple" else 0, dtype=rows.dtype)
+
+
 def _positions(index: Any, size: int) -> Tensor:
     if isinstance(index, slice):
         return torch.arange(*index.indices(size))
@@ -355,7 +330,7 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         ) from error
 
 
-def stratified_indices(
+def _stratified(
     store: TransitionStore, n: int, safe: float = 0.0, unsafe: float = 0.0, generator: torch.Generator | None = None
 ) -> Tensor:
     """Positions of n transitions: ``round(n safe)`` from S, ``round(n unsafe)`` from U, the rest from D.
@@ -381,15 +356,11 @@ def _as_it_is(batch: TensorDict) -> TensorDict:
 class RegionSampler(Sampler):
     """Draws fixed shares of each batch from the labelled sets S and U, the rest from all transitions D.
 
-    Args:
-        safe, unsafe (float): shares of S and U. Default one eighth each.
-
     Raises ConfigError if a share is negative, they add up to more than 1, or the storage is not a ``TransitionStore``.
     Source: Algorithm 1 of the paper (samples of S, U and D). Deviation: none.
 
     Example:
-        >>> buffer = TransitionStore(1000).replay_buffer(batch_size=64, safe=0.25, unsafe=0.25)
-        >>> buffer.sampler.safe
+        >>> TransitionStore(1000).replay_buffer(batch_size=64, safe=0.25, unsafe=0.25).sampler.safe
         0.25
     """
 
@@ -402,14 +373,14 @@ class RegionSampler(Sampler):
         """Positions ``(batch_size,)`` and an empty info."""
         if not isinstance(storage, TransitionStore):
             raise ConfigError(f"storage: expected a TransitionStore, received {type(storage).__name__}.")
-        return stratified_indices(storage, batch_size, self.safe, self.unsafe, self._rng), {}
+        return _stratified(storage, batch_size, self.safe, self.unsafe, self._rng), {}
 
     def state_dict(self) -> dict[str, Any]:
         """The shares."""
         return {"safe": self.safe, "unsafe": self.unsafe}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the shares."""
+        """Restores what ``state_dict`` returned."""
         self.safe, self.unsafe = state_dict["safe"], state_dict["unsafe"]
 
     def dumps(self, path: str | os.PathLike[str]) -> None:
@@ -426,4 +397,4 @@ class RegionSampler(Sampler):
         """Nothing to forget."""
 
 
-__all__ = ["RegionSampler", "TransitionStore", "stratified_indices"]
+__all__ = ["RegionSampler", "TransitionStore"]

@@ -17,9 +17,6 @@ _PLAIN = (bool, int, float, str, bytes, type(None))
 def describe(value: Any) -> Any:
     """Plain values as they are, functions by name and a digest of their code, partials by function and arguments.
 
-    Args:
-        value: such as ``partial(GymnasiumPixels, make, safe=..., unsafe=..., image_size=64)``.
-
     Returns what JSON can write. Two functions with the same digest compute the same, as far as their code, their
     defaults, what they close over and what they read from their own module go. Source: none.
 
@@ -76,14 +73,7 @@ def _names(code: CodeType) -> list[str]:
 
 
 def differences(one: Any, other: Any, path: str = "") -> list[str]:
-    """Where two descriptions differ, such as ``"image_size: 32, now 48"``.
-
-    Args:
-        one: what was.
-        other: what is.
-        path: of both, inside something larger.
-
-    Returns a line for every difference. Source: none.
+    """A line such as ``"image_size: 32, now 48"`` for every difference of what was and what is. Source: none.
 
     Example:
         >>> differences({"a": 1, "b": {"c": 2}}, {"a": 1, "b": {"c": 3}})

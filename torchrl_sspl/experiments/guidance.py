@@ -14,14 +14,7 @@ from torchrl_sspl.errors import ConfigError
 
 
 def advice(certificate: Certificate | None, config: Config) -> list[str]:
-    """What to try where an own system is not certified, the likeliest first.
-
-    Args:
-        certificate: of the run; None where it has none.
-        config: of the run.
-
-    Returns sentences without a full stop; none where both layers hold. Source: none.
-    """
+    """What to try where an own system is not certified, the likeliest first: sentences without a full stop."""
     if certificate is None:
         return []
     layers = [certificate.layers[k] for k in ("deterministic", "statistical") if k in certificate.layers]
@@ -58,10 +51,7 @@ def check_factory(make_env: Any) -> None:
 
 @torch.no_grad()
 def check_encoder(encoder: nn.Module, pixels: Tensor, latent_dim: int) -> None:
-    """One look at what an encoder makes of an observation, before anything is trained.
-
-    Raises ConfigError if it cannot take uint8 pixels, or its latents have another shape or leave [-1, 1].
-    """
+    """Raises ConfigError if an encoder cannot take uint8 pixels, or its latents have another shape or leave [-1, 1]."""
     mode, shape = encoder.training, tuple(pixels.shape)
     encoder.eval()
     try:

@@ -39,14 +39,10 @@ _UNKNOWN = (
 
 
 def write_run_report(outcome: Outcome, env: SafetyEnv | None, *, title: str | None = None) -> dict[str, Any]:
-    """Draw the figures and the film of a run, and write ``report.html`` with all of them.
+    """Draw the figures and the film of a run, and write ``report.html`` with all of them; sets ``outcome.report``.
 
-    What is drawn follows from what was measured and from ``env.system``: nothing here knows a system by name.
-
-    Args:
-        outcome: of the run; its ``report`` is set.
-        env: the system, as it was trained on; None where it is known by being run only.
-        title: title of the page; by default the system's.
+    What is drawn follows from what was measured and from ``env.system``: nothing here knows a system by name. The
+    system is as it was trained on; None where it is known by being run only.
 
     Returns matplotlib figures by title; they are in ``figures/`` of the run too. Raises MissingDependencyError if
     matplotlib is not installed. Source: paper Section V (figures); deviation: the true kernel, measurements and

@@ -1,7 +1,7 @@
 """One way from a configuration to a report: environment, networks, loss and trainer, then evaluation and certificate.
 
-``Experiment.__init__`` builds everything in the order in which it is used; ``Experiment.run`` does everything in the order
-in which it happens.
+``Experiment.__init__`` builds everything in the order in which it is used; ``Experiment.run`` does everything in the
+order in which it happens.
 """
 
 from __future__ import annotations
@@ -56,23 +56,19 @@ CONFIG_FILE = "config.json"
 
 
 def agent_phases(config: Config, *, known: bool) -> list[Phase]:
-    """The phases of a configuration: those of every round, each round ended by its checks.
-
-    Args:
-        config: of the run.
-        known: whether the environment knows its sets.
+    """The phases of a configuration: those of every round, each ended by its checks where the sets are known.
 
     Returns the phases in order; with ``synthesis.enabled=false``, or the losses as printed, the placing of the level
     alone. Source: paper Algorithm 1; deviation: two time scales.
     """
     s, e = config.synthesis, config.evaluation
-    level: dict[str, Any] = {"episodes": e.episodes, "horizon": e.horizon, "envs": e.envs, "progress": config.trainer.progress}
     if config.loss.preset == "paper":
         return []  # as printed
-    if not s.enabled:
-        return [PlaceLevel(**level)] if e.calibrate and not known else []
-    phases = synthesis_phases(s, check=CheckRound if known else None)
-    return phases if known or not e.calibrate else [*phases, PlaceLevel(s.rounds - 1, **level)]
+    phases = synthesis_phases(s, check=CheckRound if known else None) if s.enabled else []
+    if e.calibrate and not known:
+        level = {"episodes": e.episodes, "horizon": e.horizon, "envs": e.envs, "progress": config.trainer.progress}
+        phases.append(PlaceLevel(s.rounds - 1 if s.enabled else 0, **level))
+    return phases
 
 
 class Experiment:
@@ -114,15 +110,13 @@ class Experiment:
         check_encoder(self.encoder, pixels.to(self.device), config.network.latent_dim)
         self.directory = Path(config.out_dir)
         self.directory.mkdir(parents=True, exist_ok=True)
-        self.loss = SSPLLoss(self.encoder, self.dynamics, self.barrier, self.policy, **self._loss_options()).to(self.device)
+        self.loss = self._loss(self.encoder, self.dynamics, self.barrier, self.policy)
         self.logger = make_logger(config.logger.kind, config.logger.kind, self.directory, project=config.logger.project)
         # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
         self.store = TransitionStore(config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"))
         self.work = self._workspace()
         self.phases = Phases(agent_phases(config, known=self.known), self.work)
         self.trainer = self._make_trainer()
-
-    # ------------------------------------------------------------------ what it is made of
 
     def _probe(self) -> tuple[EnvBase, torch.Tensor]:
         """One environment of the system, and a look at what it shows."""
@@ -157,14 +151,15 @@ class Experiment:
         barrier = kind(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
         return tuple(m.to(self.device) for m in (encoder, dynamics, barrier, policy))  # type: ignore[return-value]
 
-    def _loss_options(self) -> dict[str, Any]:
-        return {k: v for k, v in vars(self.config.loss).items() if v is not None}
+    def _loss(self, *networks: nn.Module) -> SSPLLoss:
+        options: dict[str, Any] = {k: v for k, v in vars(self.config.loss).items() if v is not None}
+        return SSPLLoss(*networks, **options).to(self.device)
 
     def _fresh(self, attempt: int) -> SSPLLoss:
         """A loss like the trainer's with other initial weights."""
         with torch.random.fork_rng():
             torch.manual_seed(spawn(self.config.seed, "weights", attempt))
-            return SSPLLoss(*self._networks(), **self._loss_options()).to(self.device)
+            return self._loss(*self._networks())
 
     def _workspace(self) -> Workspace:
         c, seed = self.config.collector, self.config.seed
@@ -201,30 +196,26 @@ class Experiment:
             lipschitz["lipschitz_loss"] = LipschitzLoss(self.barrier)
             lipschitz["lipschitz_optimizer"] = torch.optim.Adam(self.barrier.parameters(), config.optim.lr)
         bound = config.network.lipschitz_bound
+        as_set = ("total_frames", "optim_steps_per_batch", "warm_start_steps", "warm_start_error", "checkpoint_seconds",
+                  "keep_checkpoints", "clip_norm")  # fmt: skip
         trainer = SSPLTrainer(
             collector=self._collector(rollout_policy),
-            total_frames=t.total_frames,
             loss_module=self.loss,
             optimizer=optimizer,
             replay_buffer=buffer,
-            optim_steps_per_batch=t.optim_steps_per_batch,
-            warm_start_steps=t.warm_start_steps,
-            warm_start_error=t.warm_start_error,
             target_net_updater=SoftUpdate(self.loss, tau=config.optim.target_tau) if delayed else None,
             rollout_policy=rollout_policy,
             margins=MarginHook(self.loss, buffer, lipschitz_bound=bound) if t.margins else None,
             evaluate=self._evaluate_during if t.evaluate_every else None,
             evaluate_every=max(1, t.evaluate_every),
             checkpoint_dir=self.directory / "checkpoints" if t.checkpoint_seconds >= 0 else None,
-            checkpoint_seconds=t.checkpoint_seconds,
-            keep_checkpoints=t.keep_checkpoints,
             autocast=None if t.autocast == "none" else getattr(torch, t.autocast),
             phases=self.phases,
             out_dir=self.directory,
             progress_bar=t.progress,
-            clip_norm=t.clip_norm,
             logger=self.logger,
             log_interval=0,
+            **{name: getattr(t, name) for name in as_set},
             **lipschitz,
         )
         if t.restarts and t.warm_start_error is not None and t.warm_start_steps > 0:
@@ -244,24 +235,15 @@ class Experiment:
 
     def _collector(self, policy: Any) -> Any:
         c = self.config.collector
+        as_set = ("backend", "workers", "frames_per_batch", "max_frames_per_traj", "ray_address")
         return make_collector(
-            TrainingStarts(self.make_env, [c.envs], c.starts),
-            policy,
-            backend=c.backend,
-            workers=c.workers,
-            frames_per_batch=c.frames_per_batch,
-            total_frames=self.config.trainer.total_frames,
-            init_random_frames=self.config.random_frames(),
-            max_frames_per_traj=c.max_frames_per_traj,
-            policy_device=self.device,
-            ray_address=c.ray_address,
-            seed=self.config.seed,
-        )
+            TrainingStarts(self.make_env, [c.envs], c.starts), policy, total_frames=self.config.trainer.total_frames,
+            init_random_frames=self.config.random_frames(), policy_device=self.device, seed=self.config.seed,
+            **{name: getattr(c, name) for name in as_set},
+        )  # fmt: skip
 
     def _evaluate_during(self, trainer: SSPLTrainer) -> dict[str, Any]:
         return logged(evaluate_episodes(self.agent().to(self.device), self.make_env, self.config.evaluation))
-
-    # ------------------------------------------------------------------ what it does
 
     def agent(self) -> Agent:
         """A frozen copy of the present networks, their level placed where the phases have put it."""
@@ -269,10 +251,7 @@ class Experiment:
         return Agent.from_networks(*nets, level=self.work.level, description=self.work.description)
 
     def train(self, *, resume: bool = True) -> Agent:
-        """Train, or go on from the last checkpoint.
-
-        Args:
-            resume: continue from a checkpoint in the directory, if there is one.
+        """Train, or go on from the last checkpoint in the directory if ``resume``.
 
         Returns the agent; it is in ``agent/`` too. Raises CheckpointError if the directory holds a run of another
         system, other networks or other settings; EmptyRegionError if S or U never occurs in the data. Source: paper,
@@ -331,13 +310,7 @@ class Experiment:
         return "all phases are done"
 
     def evaluate(self, agent: Agent) -> dict[str, Evaluation]:
-        """All measurements of the agent on fresh data.
-
-        Args:
-            agent: frozen agent.
-
-        Returns evaluations by name: ``"own"``, and one for every further renderer of the system. Source: none.
-        """
+        """All measurements of a frozen agent on fresh data: ``"own"``, and those of every further renderer."""
         e, progress = self.config.evaluation, self.config.trainer.progress
         if not self.known:
             return {"own": evaluate_episodes(agent, self.make_env, e, progress=progress)}
@@ -359,13 +332,7 @@ class Experiment:
         return found
 
     def certify(self, agent: Agent) -> Certificate:
-        """Issue the certificate of the agent, and keep it beside the agent.
-
-        Args:
-            agent: frozen agent.
-
-        Returns the certificate. Source: none.
-        """
+        """Issue the certificate of a frozen agent, and keep it beside the agent."""
         e, progress = self.config.evaluation, self.config.trainer.progress
         budget, name = Budget(seconds=e.certificate_seconds), self.directory.name
         if self.known or not e.certificate_episodes:
@@ -382,12 +349,10 @@ class Experiment:
         return certificate
 
     def run(self, *, resume: bool = True) -> Outcome:
-        """Train (or load ``config.agent``), evaluate on fresh data, certify, and report; all lands in ``config.out_dir``.
+        """Train (or load ``config.agent``), evaluate on fresh data, certify, and report.
 
-        Args:
-            resume: continue from a checkpoint in the directory, if there is one.
-
-        Returns the outcome; ``metrics.json``, ``report.html`` and ``agent/`` are on disk. Source: none.
+        With ``resume`` a training goes on from a checkpoint in ``config.out_dir``, if there is one. There
+        ``metrics.json``, ``report.html`` and ``agent/`` land. Source: none.
         """
         trained = not self.config.agent
         agent = (self.train(resume=resume) if trained else load(self.config.agent)).to(self.device)
@@ -418,7 +383,6 @@ class Experiment:
 
     def _budget(self) -> dict[str, int]:
         source = self.work.source
-        assert source is not None
         if not source.budget["transitions"]:
             source.count(self.store)
         return dict(source.budget)
@@ -446,14 +410,7 @@ class Experiment:
 
 
 def finish(experiment: Experiment, outcome: Outcome) -> Outcome:
-    """Write metrics and report of a run, then give figures and numbers to its logger.
-
-    Args:
-        experiment: the run.
-        outcome: what it has produced.
-
-    Returns the outcome with its report. Source: none.
-    """
+    """Write metrics and report of a run, then give figures and numbers to its logger; the outcome with its report."""
     write_metrics(outcome)
     frames = experiment.trainer.collected_frames
     figures: dict[str, Any] = {}

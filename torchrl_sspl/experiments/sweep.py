@@ -1,7 +1,8 @@
 """Many runs of one command: every combination of the values that are given, each in a process and a directory of its own.
 
-On Ray a run is one task of Ray core, which is all it needs: a run writes its own results and takes itself up again where it was
-interrupted, so Ray Tune's searchers, stopping rules, checkpoints and result files would be a second set of what is there.
+On Ray a run is one task of Ray core, which is all it needs: a run writes its own results and takes itself up again
+where it was interrupted, so Ray Tune's searchers, stopping rules, checkpoints and result files would be a second set of
+what is there.
 """
 
 from __future__ import annotations
@@ -34,21 +35,13 @@ GRACE = 60.0  # seconds that an interrupted run has to save its state
 
 @dataclass
 class Task:
-    """One run of a sweep.
+    """One run of a sweep."""
 
-    Attributes:
-        name: what tells it from the others, such as "seed=1,synthesis.margin=0.05".
-        config: its configuration.
-        words: its command line, after ``sspl train``.
-        status: "waiting", "done", "done before", "interrupted" or "failed (exit code n)".
-        seconds: wall clock.
-    """
-
-    name: str
+    name: str  # what tells it from the others, such as "seed=1,synthesis.margin=0.05"
     config: Config
-    words: list[str]
-    status: str = "waiting"
-    seconds: float = 0.0
+    words: list[str]  # its command line, after ``sspl train``
+    status: str = "waiting"  # or "done", "done before", "interrupted", "failed (exit code n)"
+    seconds: float = 0.0  # wall clock
 
     @property
     def directory(self) -> Path:
@@ -68,21 +61,13 @@ class Task:
 
 @dataclass
 class Sweep:
-    """What a sweep did.
+    """What a sweep did."""
 
-    Attributes:
-        directory: where all runs lie, with ``sweep.json`` and ``comparison.html``.
-        tasks: the runs.
-        rows: the table over them.
-        page: the comparison page; None where no run came to an end.
-        signal: number of the signal that ended it, or 0.
-    """
-
-    directory: Path
+    directory: Path  # where all runs lie, with ``sweep.json`` and ``comparison.html``
     tasks: list[Task]
-    rows: list[Row] = field(default_factory=list)
-    page: Path | None = None
-    signal: int = 0
+    rows: list[Row] = field(default_factory=list)  # of the table over them
+    page: Path | None = None  # of the comparison; None where no run came to an end
+    signal: int = 0  # number of the signal that ended it
 
     @property
     def exit_code(self) -> int:
@@ -98,13 +83,9 @@ class Sweep:
 
 
 def expand(overrides: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
-    """Every combination of values that are separated by commas.
+    """Name and values by key of every combination of values that commas separate outside of brackets and quotes.
 
-    Args:
-        overrides: ``key=value`` strings; commas within brackets or quotes do not separate.
-
-    Returns the name and the values by key of each run. Raises ConfigError if a value is empty or given twice, or ``out_dir``
-    has several. Source: none.
+    Raises ConfigError if a value is empty or given twice, or ``out_dir`` has several. Source: none.
 
     Example:
         >>> [name for name, _ in expand(["seed=0,1", "network.policy_hidden=[8,8]", "optim.lr=.1"])]
@@ -140,10 +121,7 @@ def _split(value: str) -> list[str]:
 def plan(overrides: Sequence[str]) -> tuple[Path, list[Task]]:
     """Directory and runs of a sweep; every configuration is composed and checked, nothing is written.
 
-    Args:
-        overrides: see :func:`expand`.
-
-    Returns the directory and the runs. Raises ConfigError if one of the configurations is not valid. Source: none.
+    Raises ConfigError if one of the configurations is not valid. Source: none.
     """
     tasks: list[Task] = []
     folders = set()
@@ -165,18 +143,20 @@ def sweep(
 ) -> Sweep:
     """Train every combination, then compare.
 
-    A run that fails does not stop the others. Runs that came to an end before are not run again, others go on where they
-    were. SIGINT and SIGTERM are handed on to the runs, which save their state.
+    A run that fails does not stop the others. Runs that came to an end before are not run again, others go on where
+    they were. SIGINT and SIGTERM are handed on to the runs, which save their state.
 
     Args:
-        overrides: ``key=value`` strings, several values separated by commas: ``["seed=0,1,2", "synthesis.margin=.05,.1"]``.
+        overrides: ``key=value`` strings, several values separated by commas: ``["seed=0,1,2",
+            "synthesis.margin=.05,.1"]``.
         launcher: "local" (processes of this machine) or "ray" (tasks of a cluster whose machines share the folder; its
             address is ``collector.ray_address``).
         jobs: runs at a time; default: as many as there are cores, on Ray as many as it has room for.
         command: what is called with the words of each run.
 
     Returns what was done; ``sweep.json`` and ``comparison.html`` are on disk. Raises ConfigError if a configuration is
-    not valid, before anything is started, and MissingDependencyError if Ray is asked for and not installed. Source: none.
+    not valid, before anything is started, and MissingDependencyError if Ray is asked for and not installed. Source:
+    none.
     """
     if launcher not in LAUNCHERS:
         raise ConfigError(f"expected --launcher to be one of {', '.join(LAUNCHERS)}, received '{launcher}'")

@@ -30,24 +30,9 @@ _NAMES = {
     "SSPLTrainer": "trainer",
 }
 __all__ = [
-    "Check",
-    "CheckRound",
-    "FineTune",
-    "FitDynamics",
-    "FitSets",
-    "Gather",
-    "InnerLoop",
-    "Phase",
-    "Phases",
-    "PlaceLevel",
-    "SSPLTrainer",
-    "Source",
-    "SteerPolicy",
-    "TeachPolicy",
-    "Workspace",
-    "starts_of",
-    "synthesis_phases",
-]
+    "Check", "CheckRound", "FineTune", "FitDynamics", "FitSets", "Gather", "InnerLoop", "Phase", "Phases", "PlaceLevel",
+    "SSPLTrainer", "Source", "SteerPolicy", "TeachPolicy", "Workspace", "starts_of", "synthesis_phases",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:

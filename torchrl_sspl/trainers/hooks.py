@@ -23,13 +23,36 @@ from torchrl_sspl.objectives import SSPLLoss
 MARGINS = ("safety_margin", "dynamics_margin")
 
 
-class MarginHook(TrainerHookBase):
+class _Hook(TrainerHookBase):
+    """Where a hook acts, as stage -> method, under which name it is registered, and which attributes are its state."""
+
+    name = ""
+    stages: Mapping[str, str] = {}
+    kept: tuple[str, ...] = ()
+
+    def state_dict(self) -> dict[str, Any]:
+        """What a checkpoint holds."""
+        return {key: getattr(self, key) for key in self.kept}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restores what ``state_dict`` returned."""
+        for key in self.kept:
+            setattr(self, key, type(getattr(self, key))(state_dict[key]))
+
+    def register(self, trainer: Trainer, name: str | None = None) -> None:
+        """Attaches the hook to the trainer."""
+        for stage, method in self.stages.items():
+            trainer.register_op(stage, self if method == "__call__" else getattr(self, method))
+        trainer.register_module(name or self.name, self)
+
+
+class MarginHook(_Hook):
     r"""Re-estimates the margins before the steps of every collected batch.
 
     .. math:: \psi \leftarrow L_B \bar\epsilon, \qquad \eta \leftarrow L_B \delta
 
-    with the covering radius :math:`\bar\epsilon` of one half of a sample of latents by the other, and
-    :math:`\delta` the chosen quantile of the latent prediction error on the sample.
+    with the covering radius :math:`\bar\epsilon` of one half of a sample of latents by the other, and :math:`\delta`
+    the chosen quantile of the latent prediction error on the sample.
 
     Args:
         loss: the loss whose buffers are set.
@@ -38,17 +61,18 @@ class MarginHook(TrainerHookBase):
         update: which margins are set; the others are estimated and logged only.
         samples: transitions in the sample.
         quantile: quantile of both estimates, 1 for the maximum (paper).
-        maximum: largest margin that is set, in units of the barrier; early estimates can be larger
-            than anything that a barrier can satisfy.
+        maximum: largest margin that is set, units of the barrier; early estimates can exceed all that a barrier can
+            satisfy.
 
     Raises ConfigError if an argument is not valid. Source: paper, Algorithm 1, with eq. (6) and (11).
 
     Example:
         >>> from torchrl_sspl.data import TransitionStore
-        >>> hook = MarginHook(None, TransitionStore(8).replay_buffer(4), lipschitz_bound=2.0)
-        >>> hook.update
+        >>> MarginHook(None, TransitionStore(8).replay_buffer(4), lipschitz_bound=2.0).update
         ('safety_margin', 'dynamics_margin')
     """
+
+    name, stages, kept = "margins", {"pre_optim_steps": "__call__", "post_steps_log": "log"}, ("last",)
 
     def __init__(
         self,
@@ -105,37 +129,15 @@ class MarginHook(TrainerHookBase):
         """Radius, error and margins in force."""
         return {**self.last, "log_pbar": False} if self.last else None
 
-    def state_dict(self) -> dict[str, Any]:
-        """The last estimates; the margins themselves are buffers of the loss."""
-        return {"last": dict(self.last)}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restores what ``state_dict`` returned."""
-        self.last = dict(state_dict["last"])
-
-    def register(self, trainer: Trainer, name: str = "margins") -> None:
-        """Attaches the hook to ``pre_optim_steps`` and ``post_steps_log``."""
-        trainer.register_op("pre_optim_steps", self)
-        trainer.register_op("post_steps_log", self.log)
-        trainer.register_module(name, self)
-
-
-class SeedHook(TrainerHookBase):
+class SeedHook(_Hook):
     """Gives the environments a new seed, drawn from torch's generator, before every collected batch.
 
-    A checkpoint cannot hold the inner state of an arbitrary environment. With this seed and with a
-    collector that resets at each iteration, what a batch holds depends on nothing else than what the
-    checkpoint does hold.
-
-    Args:
-        collector: the collector whose environments are seeded.
-
-    Source: none.
-
-    Example:
-        >>> SeedHook(None).state_dict()
-        {'seed': -1}
+    A checkpoint cannot hold the inner state of an arbitrary environment. With this seed and a collector that resets at
+    each iteration, what a batch holds depends on nothing else than what the checkpoint does hold. Source: none.
     """
+
+    name, stages, kept = "seeds", {"setup": "setup", "post_steps": "__call__"}, ("seed",)
 
     def __init__(self, collector: Any) -> None:
         self.collector, self.seed = collector, -1
@@ -152,36 +154,14 @@ class SeedHook(TrainerHookBase):
         self.seed = int(torch.randint(2**31 - 1, (), dtype=torch.int64))
         self.collector.set_seed(self.seed)
 
-    def state_dict(self) -> dict[str, int]:
-        """The seed of the next batch."""
-        return {"seed": self.seed}
 
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Restores what ``state_dict`` returned."""
-        self.seed = int(state_dict["seed"])
+class FitEncoderHook(_Hook):
+    """Lets an encoder take statistics of frames before the first optimiser step, and after a restart.
 
-    def register(self, trainer: Trainer, name: str = "seeds") -> None:
-        """Attaches the hook to ``setup`` and ``post_steps``."""
-        trainer.register_op("setup", self.setup)
-        trainer.register_op("post_steps", self)
-        trainer.register_module(name, self)
-
-
-class FitEncoderHook(TrainerHookBase):
-    """Lets an encoder with a method ``fit`` take statistics of frames before the first optimiser step, and after a restart.
-
-    Args:
-        trainer: the trainer; its stepper counts the steps.
-        encoder: has ``fit(frames)``, frames uint8 ``(n, 3, H, W)``.
-        store: where frames come from.
-        frames: how many, of transitions spread over the whole store.
-
-    Source: none.
-
-    Example:
-        >>> FitEncoderHook(None, None, None).state_dict()
-        {}
+    It has a method ``fit(frames)``, frames uint8 ``(n, 3, H, W)``; those are spread over the whole store. Source: none.
     """
+
+    name, stages = "fit_encoder", {"pre_optim_steps": "__call__"}
 
     def __init__(self, trainer: Any, encoder: Any, store: Any, *, frames: int = 2000) -> None:
         self.trainer, self.encoder, self.store, self.frames = trainer, encoder, store, frames
@@ -192,26 +172,11 @@ class FitEncoderHook(TrainerHookBase):
             index = torch.linspace(0, len(self.store) - 1, min(self.frames, len(self.store))).long()
             self.encoder.fit(self.store.get(index)["frames"][:, 1])
 
-    def state_dict(self) -> dict[str, Any]:
-        """Nothing: the statistics are buffers of the encoder."""
-        return {}
 
-    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Nothing to restore."""
+class ClockHook(_Hook):
+    """Counts the seconds of a training over all of its interruptions. Source: none."""
 
-    def register(self, trainer: Trainer, name: str = "fit_encoder") -> None:
-        """Attaches the hook to ``pre_optim_steps``."""
-        trainer.register_op("pre_optim_steps", self)
-        trainer.register_module(name, self)
-
-
-class ClockHook(TrainerHookBase):
-    """Counts the seconds of a training over all of its interruptions. Source: none.
-
-    Example:
-        >>> ClockHook().seconds < 1.0
-        True
-    """
+    name = "clock"
 
     def __init__(self) -> None:
         self._before, self._began = 0.0, time.monotonic()
@@ -226,31 +191,21 @@ class ClockHook(TrainerHookBase):
         self._began = time.monotonic()
 
     def state_dict(self) -> dict[str, float]:
-        """The seconds so far."""
         return {"seconds": self.seconds}
 
     def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Restores what ``state_dict`` returned."""
         self._before, self._began = float(state_dict["seconds"]), time.monotonic()
 
-    def register(self, trainer: Trainer, name: str = "clock") -> None:
-        """Registers the state alone."""
-        trainer.register_module(name, self)
 
-
-class LogHook(TrainerHookBase):
+class LogHook(_Hook):
     """Appends the mean terms of every batch's steps to ``log.jsonl``, and stops at a loss that is not finite.
 
     What was logged after a checkpoint, also by the phases, is cut off when it is loaded: it will be logged again.
 
-    Args:
-        path: the file; ``None``: nothing is written.
-
-    Raises ConfigError when called with a loss that is NaN or infinite. Source: none.
-
-    Example:
-        >>> LogHook(None)(7, {"loss_safe": torch.zeros(())})
+    Without a path nothing is written. Raises ConfigError when called with a loss that is NaN or infinite. Source: none.
     """
+
+    name, stages = "log", {"post_optim_complete_log": "__call__"}
 
     def __init__(self, path: str | Path | None) -> None:
         self.path = None if path is None else Path(path)
@@ -269,7 +224,6 @@ class LogHook(TrainerHookBase):
                 file.write(json.dumps({"phase": "joint", "round": 0, "step": step, **row}) + "\n")
 
     def state_dict(self) -> dict[str, int]:
-        """How long the file is."""
         return {"bytes": self.path.stat().st_size if self.path is not None and self.path.is_file() else 0}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
@@ -277,19 +231,14 @@ class LogHook(TrainerHookBase):
         if self.path is not None and self.state_dict()["bytes"] > int(state_dict["bytes"]):
             os.truncate(self.path, int(state_dict["bytes"]))
 
-    def register(self, trainer: Trainer, name: str = "log") -> None:
-        """Attaches the hook to ``post_optim_complete_log``."""
-        trainer.register_op("post_optim_complete_log", self)
-        trainer.register_module(name, self)
 
-
-class RestartHook(TrainerHookBase):
+class RestartHook(_Hook):
     """Begins again with fresh weights where the warm start does not tell S from U.
 
-    Joint training of encoder and barrier has poor local optima: latents that predict well and leave out what S and U differ
-    in. No number of further steps leads out of them; other initial weights mostly do. The hook looks at the stepper before
-    the steps of every collected batch, and begins again if the share on the wrong side of the barrier is no longer falling
-    (by a fifth since the last look). The data are kept, the steps are gone.
+    Joint training of encoder and barrier has poor local optima: latents that predict well and leave out what S and U
+    differ in. No number of further steps leads out of them; other initial weights mostly do. The hook looks at the
+    stepper before the steps of every collected batch, and begins again if the share on the wrong side of the barrier is
+    no longer falling (by a fifth since the last look). The data are kept, the steps are gone.
 
     Args:
         trainer: the trainer; its stepper has a ``warm_start_error``.
@@ -298,11 +247,10 @@ class RestartHook(TrainerHookBase):
         most: fresh starts at most.
 
     Raises ConfigError if a number is not positive. Source: none; the paper does not start again.
-
-    Example:
-        >>> RestartHook(None, lambda attempt: None, after=1200, most=2).state_dict()
-        {'restarts': 0, 'last': 2.0}
     """
+
+    name, stages = "restarts", {"pre_optim_steps": "__call__", "post_steps_log": "log"}
+    kept = ("restarts", "last")
 
     def __init__(self, trainer: Any, fresh: Callable[[int], SSPLLoss], *, after: int, most: int) -> None:
         if after < 1 or most < 1:
@@ -329,37 +277,20 @@ class RestartHook(TrainerHookBase):
         """The number of fresh starts so far."""
         return {"restarts": self.restarts, "log_pbar": False}
 
-    def state_dict(self) -> dict[str, float]:
-        """The number of fresh starts, and what was seen at the last look."""
-        return {"restarts": self.restarts, "last": self.last}
 
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Restores what ``state_dict`` returned."""
-        self.restarts, self.last = int(state_dict["restarts"]), float(state_dict["last"])
-
-    def register(self, trainer: Trainer, name: str = "restarts") -> None:
-        """Attaches the hook to ``pre_optim_steps`` and ``post_steps_log``."""
-        trainer.register_op("pre_optim_steps", self)
-        trainer.register_op("post_steps_log", self.log)
-        trainer.register_module(name, self)
-
-
-class EveryHook(TrainerHookBase):
+class EveryHook(_Hook):
     """Runs something every so many collected batches, on frozen networks, and logs what it returns.
 
     Args:
         trainer: the trainer.
-        call: ``trainer -> mapping of floats``. With the entry ``"stop"`` (a text, or ``None``) it can end the
-            training: the certificate holds, the figures are reached.
+        call: ``trainer -> mapping of floats``; an entry ``"stop"``, a text that is not ``None``, ends the training.
         every: collected batches between two calls.
 
     Raises ConfigError if ``every`` is not positive. Source: paper, Algorithm 1 (stop rule); deviation: the printed
     rule, a total loss of zero, is never met.
-
-    Example:
-        >>> EveryHook(None, lambda trainer: {}, every=5).state_dict()
-        {'count': 0}
     """
+
+    name, stages, kept = "every", {"post_steps_log": "__call__"}, ("count",)
 
     def __init__(self, trainer: Any, call: Callable[[Any], Mapping[str, Any]], *, every: int = 1) -> None:
         if every < 1:
@@ -378,16 +309,3 @@ class EveryHook(TrainerHookBase):
         if reason is not None:
             self.trainer.request_stop(str(reason))
         return {**result, "log_pbar": False} if result else None
-
-    def state_dict(self) -> dict[str, int]:
-        """The number of batches seen."""
-        return {"count": self.count}
-
-    def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Restores what ``state_dict`` returned."""
-        self.count = int(state_dict["count"])
-
-    def register(self, trainer: Trainer, name: str = "every") -> None:
-        """Attaches the hook to ``post_steps_log``."""
-        trainer.register_op("post_steps_log", self)
-        trainer.register_module(name, self)

@@ -86,22 +86,11 @@ METRICS: Mapping[str, str] = MappingProxyType(
 def make_logger(
     kind: str = "csv", name: str = "run", directory: str | Path = "runs", *, project: str = "torchrl-sspl"
 ) -> Any:
-    """A TorchRL logger that works wherever it is started.
+    """A TorchRL logger of a kind in :data:`LOGGERS` that works wherever it is started; ``None`` for ``"none"``.
 
-    Args:
-        kind: ``"csv"`` (default), ``"wandb"``, ``"tensorboard"`` or ``"none"``. wandb writes to disk only, to be
-            uploaded with ``wandb sync``, where there is no key or its server cannot be reached; ``WANDB_MODE``, if
-            set, decides instead.
-        name: name of the run.
-        directory: folder in which the logger writes.
-        project: project of wandb.
-
-    Returns the logger, or ``None`` for ``"none"``. Raises ConfigError if the kind is unknown; MissingDependencyError if
-    its package is not installed. Source: none.
-
-    Example:
-        >>> make_logger("none") is None
-        True
+    wandb writes to disk only, to be uploaded with ``wandb sync``, where there is no key or its server cannot be
+    reached; ``WANDB_MODE``, if set, decides instead. Raises ConfigError if the kind is unknown; MissingDependencyError
+    if its package is not installed. Source: none.
     """
     if kind not in LOGGERS:
         raise ConfigError(f"expected logger to be one of {', '.join(LOGGERS)}, received '{kind}'")
@@ -129,17 +118,13 @@ def make_logger(
 
 
 def wandb_offline() -> bool:
-    """Whether a wandb run has to stay on disk: no key, or no way to its server.
-
-    Returns true if so; ``WANDB_MODE`` decides where it is set. Source: none.
-    """
+    """Whether a wandb run has to stay on disk: ``WANDB_MODE`` says so, or there is no key, or no way to its server."""
     mode = os.environ.get("WANDB_MODE", "").lower()
     if mode:
         return mode in ("offline", "dryrun", "disabled")
-    if not (os.environ.get("WANDB_API_KEY") or _stored_key()):
+    host, _, port = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0].partition(":")
+    if not (os.environ.get("WANDB_API_KEY") or _stored_key(host)):
         return True
-    host = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0]
-    host, _, port = host.partition(":")
     try:
         socket.create_connection((host, int(port or 443)), timeout=3).close()
     except (OSError, ValueError):
@@ -147,14 +132,11 @@ def wandb_offline() -> bool:
     return False
 
 
-def _stored_key() -> str | None:
+def _stored_key(host: str) -> str | None:
     """Key that ``wandb login`` has left in the netrc file."""
     import netrc
 
     path = Path(os.environ.get("NETRC", "~/.netrc")).expanduser()
-    if not path.is_file():
-        return None
-    host = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0].partition(":")[0]
     try:
         found = netrc.netrc(str(path)).authenticators(host)
     except (OSError, netrc.NetrcParseError):
@@ -163,17 +145,9 @@ def _stored_key() -> str | None:
 
 
 def log_scalars(logger: Any, values: Mapping[str, Any], step: int) -> None:
-    """Give a logger the metrics of a step, in one row where it has rows; its failure is a warning.
-
-    Args:
-        logger: TorchRL logger, or ``None``.
-        values: names, all of them in :data:`METRICS`, and numbers.
-        step: collected frames, or optimiser steps.
+    """Give a logger, if any, the metrics of a step (frames or optimiser steps) in one row; its failure is a warning.
 
     Raises ConfigError if a name is not in :data:`METRICS`. Source: none.
-
-    Example:
-        >>> log_scalars(None, {"grad_norm": 1.0}, step=0)
     """
     unknown = sorted(set(values) - set(METRICS))
     if unknown:
@@ -188,19 +162,9 @@ def log_scalars(logger: Any, values: Mapping[str, Any], step: int) -> None:
 
 
 def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
-    """Give a matplotlib figure to a TorchRL logger, as far as that kind of logger can take one; its failure is a warning.
+    """Give a matplotlib figure to a TorchRL logger, as far as that kind can take one; its failure is a warning.
 
-    Args:
-        logger: a wandb, tensorboard or csv logger; the latter keeps a png file beside its scalars.
-        name: name of the figure.
-        figure: matplotlib figure.
-        step: collected frames.
-
-    Returns the file that was written, if any. Source: none.
-
-    Example:
-        >>> log_figure(None, "latent", None, 0) is None
-        True
+    A csv logger keeps a png file beside its scalars; returns the file that was written, if any. Source: none.
     """
     with _costs_a_warning(logger, f"the figure '{name}'"):
         run, experiment = _wandb_run(logger), _experiment(logger)
@@ -222,22 +186,10 @@ def log_figure(logger: Any, name: str, figure: Any, step: int) -> Path | None:
 
 
 def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 10) -> Path | None:
-    """Give a film to a TorchRL logger, with no package beyond Pillow; its failure is a warning.
+    """Give a film ``(T, 3, H, W)`` uint8 to a TorchRL logger, with no package beyond Pillow; its failure is a warning.
 
-    Args:
-        logger: a wandb, tensorboard or csv logger; the latter keeps a gif file beside its scalars.
-        name: name of the film.
-        frames: ``(T, 3, H, W)`` uint8.
-        step: collected frames.
-        fps: frames per second.
-
-    Returns the file that was written, if any. Raises ShapeError if there is no frame, or the shape does not fit;
-    DTypeError if the frames are not uint8. Source: none.
-
-    Example:
-        >>> import torch
-        >>> log_video(None, "episode", torch.zeros(2, 3, 8, 8, dtype=torch.uint8), 0) is None
-        True
+    A csv logger keeps a gif file beside its scalars; returns the file that was written, if any. Raises ShapeError if
+    there is no frame, or the shape does not fit; DTypeError if the frames are not uint8. Source: none.
     """
     if str(frames.dtype) != "torch.uint8":
         raise DTypeError(f"frames: expected torch.uint8, received {frames.dtype}; keep pictures unconverted.")
@@ -270,10 +222,7 @@ def log_video(logger: Any, name: str, frames: Tensor, step: int, *, fps: int = 1
 
 
 def encode_gif(frames: Tensor, fps: int = 10) -> bytes:
-    """Frames ``(T, 3, H, W)`` uint8 as the bytes of an endless gif.
-
-    Raises MissingDependencyError if Pillow is not installed. Source: none.
-    """
+    """Frames ``(T, 3, H, W)`` uint8 as an endless gif; raises MissingDependencyError if Pillow is not installed."""
     _need("PIL", "viz")
     from PIL import Image
 
@@ -285,13 +234,7 @@ def encode_gif(frames: Tensor, fps: int = 10) -> bytes:
 
 
 def close_logger(logger: Any) -> None:
-    """Write what a logger still holds, and end a wandb run.
-
-    Args:
-        logger: TorchRL logger, or ``None``.
-
-    Source: none.
-    """
+    """Write what a logger, if any, still holds, and end a wandb run. Source: none."""
     with _costs_a_warning(logger, "what it still holds"):
         run, experiment = _wandb_run(logger), _experiment(logger)
         if run is not None:

@@ -1,8 +1,7 @@
 r"""Phases that follow the joint training, as one hook of a TorchRL trainer, each resumable at any step.
 
-A phase is a small object with a name, a size and ``run(work)``. What the phases share, above all the frozen encoder's
-latents and the networks trained on them, is the :class:`Workspace`; its :class:`InnerLoop` is the one optimiser loop on
-frozen tensors. :class:`Phases` runs them in order, in any trainer.
+A phase is a small object with a name, a size and ``run(work)``. What the phases share is the :class:`Workspace`; its
+:class:`InnerLoop` is the one optimiser loop on frozen tensors. :class:`Phases` runs them in order, in any trainer.
 """
 
 from __future__ import annotations
@@ -27,15 +26,13 @@ from torchrl_sspl.trainers.loggers import METRICS, log_scalars
 from torchrl_sspl.trainers.source import Source
 
 LOG_FILE = "log.jsonl"
+_PLAIN = ("kept_share", "told", "level", "warnings", "skip")  # of a workspace's state, what JSON can write
 
 
 class InnerLoop:
     """The optimiser loop on frozen tensors that all phases share: Adam, one cycle of the learning rate, exact resume.
 
-    Args:
-        seed: seed of the generator that batches are drawn with.
-
-    Source: none.
+    The seed is that of the generator that batches are drawn with. Source: none.
 
     Example:
         >>> weight = nn.Linear(1, 1)
@@ -109,44 +106,32 @@ class InnerLoop:
         state: dict[str, Any] = {"step": self.step, "generator": self.generator.get_state(), "inside": self._live is not None}
         if self._live is not None:
             adam, cycle = self._live
-            state |= {"optimiser": adam.state_dict(), "schedule": _plain(cycle), "global_rng": torch.get_rng_state()}
+            # OneCycleLR keeps a bound method.
+            schedule = {k: v for k, v in cycle.state_dict().items() if not callable(v)}
+            state |= {"optimiser": adam.state_dict(), "schedule": schedule, "global_rng": torch.get_rng_state()}
         return state
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
         self.step = int(state["step"])
         self.generator.set_state(state["generator"])
-        self._live = None
-        self._saved = dict(state) if state["inside"] else None
+        self._live, self._saved = None, dict(state) if state["inside"] else None
 
 
 @dataclass
 class Check:
-    """Held-out checks of one round.
-
-    Attributes:
-        round: number of the round.
-        level: shift of the barrier with which the checks were made; {B <= level} became {B <= 0}.
-        unsafe_inside: held-out observations of U inside the set.
-        safe_outside: held-out observations of S outside the set.
-        left: held-out episodes that left the set.
-        touched: held-out episodes that touched U.
-        returned: share of held-out episodes from U that ended inside the set.
-        size: share of the held-out unlabelled observations inside the set.
-        passed: whether the set may be returned.
-        reason: why not.
-    """
+    """Held-out checks of one round: observations and episodes that were not trained on, counted."""
 
     round: int
-    level: float
-    unsafe_inside: int
-    safe_outside: int
-    left: int
-    touched: int
-    returned: float
-    size: float
-    passed: bool
-    reason: str
+    level: float  # shift of the barrier with which the checks were made; {B <= level} became {B <= 0}
+    unsafe_inside: int  # observations of U inside the set
+    safe_outside: int  # observations of S outside the set
+    left: int  # episodes that left the set
+    touched: int  # episodes that touched U
+    returned: float  # share of the episodes from U that ended inside the set
+    size: float  # share of the unlabelled observations inside the set
+    passed: bool  # whether the set may be returned
+    reason: str  # why not
 
 
 class Workspace:
@@ -182,7 +167,8 @@ class Workspace:
         named = {"dynamics": dynamics, "barrier": barrier, "policy": policy}
         self.originals = {k: getattr(net, "module", net) for k, net in named.items()}
         self.encoder = getattr(encoder, "module", encoder)
-        self.config, self.source, self.seed = config or SynthesisConfig(), source, seed
+        self.config, self.seed = config or SynthesisConfig(), seed
+        self.source: Any = source
         self.out_dir = None if out_dir is None else Path(out_dir)
         self.description = dict(description or {})
         self.loop = InnerLoop(seed)
@@ -244,8 +230,7 @@ class Workspace:
     def agent(self, level: float | None = None) -> Agent:
         """A frozen copy of the present networks; {B <= level} becomes {B <= 0}."""
         level = self.level if level is None else level
-        nets = self.dynamics, self.barrier, self.policy
-        return Agent.from_networks(self.encoder, *nets, level=level, description=self.description)
+        return Agent.from_networks(self.encoder, *self.networks.values(), level=level, description=self.description)
 
     def keep(self, rank: Any, number: int, level: float) -> None:
         """Remember the present networks as the best so far."""
@@ -275,23 +260,16 @@ class Workspace:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that cannot be computed again."""
+        plain = {key: getattr(self, key) for key in _PLAIN}
+        plain["checks"] = [vars(c) for c in self.checks]
+        plain["budget"] = {} if self.source is None else self.source.budget
         return {
             "networks": self.networks.state_dict(),
             "latents": dict(self.latents),
             "counterexamples": self.counterexamples,
             "taught": None if self.taught is None else self.taught.state_dict(),
             "best": self.best,
-            "plain": json.dumps(
-                {
-                    "kept_share": self.kept_share,
-                    "told": self.told,
-                    "checks": [vars(c) for c in self.checks],
-                    "level": self.level,
-                    "warnings": self.warnings,
-                    "skip": self.skip,
-                    "budget": {} if self.source is None else self.source.budget,
-                }
-            ),
+            "plain": json.dumps(plain),
             "loop": self.loop.state_dict(),
         }
 
@@ -304,8 +282,8 @@ class Workspace:
             self.taught = copy.deepcopy(self.policy).requires_grad_(False)
             self.taught.load_state_dict(state["taught"])
         plain = json.loads(state["plain"])
-        self.kept_share, self.level, self.warnings = plain["kept_share"], plain["level"], plain["warnings"]
-        self.skip, self.told = plain["skip"], plain["told"]
+        for key in _PLAIN:
+            setattr(self, key, plain[key])
         self.checks = [Check(**c) for c in plain["checks"]]
         if self.source is not None:
             self.source.budget.update(plain["budget"])
@@ -313,12 +291,7 @@ class Workspace:
 
 
 class Phase:
-    """One phase; subclass it and give ``run``, and ``size`` where it takes optimiser steps.
-
-    Args:
-        number: the round that it belongs to.
-
-    Source: none.
+    """One phase of a round; subclass it and give ``run``, and ``size`` where it takes optimiser steps. Source: none.
 
     Example:
         >>> class CountUnsafe(Phase):
@@ -344,14 +317,9 @@ class Phase:
 
 
 class Phases(TrainerHookBase):
-    """Runs phases, in order, when a trainer has collected all of its transitions.
+    """Runs phases on what they share, in order, when a trainer has collected all of its transitions.
 
-    Args:
-        phases: the phases.
-        work: what they share.
-        progress: show a progress bar.
-
-    Source: paper Algorithm 1; deviation: two time scales.
+    ``progress`` shows a bar. Source: paper Algorithm 1; deviation: two time scales.
 
     Example:
         >>> Phases([], None).state_dict()["done"]
@@ -441,15 +409,9 @@ class Phases(TrainerHookBase):
             self.work.load_state_dict(state["work"])
 
     def register(self, trainer: Trainer, name: str = "phases") -> None:
-        """Attaches the hook to ``post_steps``."""
         self.trainer = trainer
         trainer.register_op("post_steps", self)
         trainer.register_module(name, self)
-
-
-def _plain(schedule: Any) -> dict[str, Any]:
-    """State of a schedule without what is no number (OneCycleLR keeps a bound method)."""
-    return {k: v for k, v in schedule.state_dict().items() if not callable(v)}
 
 
 def _own(value: Any) -> Any:

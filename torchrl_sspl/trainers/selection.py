@@ -38,15 +38,16 @@ class _HeldOut:
 class CheckRound(Phase):
     """Held-out checks of a round; the level is moved to the largest set that passes them.
 
-    The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations of U
-    for every episode, 32,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim, in the first
-    steps, so many short episodes say more than few long ones. Source: none; the paper stops at a total loss of zero.
+    The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations
+    of U for every episode, 32,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim,
+    in the first steps, so many short episodes say more than few long ones. Source: none; the paper stops at a total
+    loss of zero.
     """
 
     name = "check"
 
     def run(self, work: Workspace) -> None:
-        """Append to ``work.checks``; keep the networks if they are the best that has passed."""
+        """Appends to ``work.checks``; keeps the networks if they are the best that has passed."""
         agent = work.agent(0.0)
         held_out = self._held_out(work, agent)
         if held_out is None:
@@ -65,7 +66,6 @@ class CheckRound(Phase):
 
     def _held_out(self, work: Workspace, agent: Agent) -> _HeldOut | None:
         s, source = work.config, work.source
-        assert source is not None
         env, n = source.env, s.check_episodes
         generator = torch.Generator().manual_seed(spawn(work.seed, "checks", self.number))
 
@@ -105,14 +105,7 @@ class CheckRound(Phase):
 class PlaceLevel(Phase):
     """The zero level between held-out observations of U and S, for systems that are known by being run only.
 
-    Args:
-        number: the round that it belongs to.
-        episodes: under the policy, and as many under random actions.
-        horizon: steps per episode.
-        envs: environments stepped together.
-        progress: show progress bars.
-
-    Source: none.
+    They come from as many ``episodes`` of ``horizon`` steps under the policy as under random actions. Source: none.
     """
 
     name = "level"
@@ -122,14 +115,12 @@ class PlaceLevel(Phase):
         self.episodes, self.horizon, self.envs, self.progress = episodes, horizon, envs, progress
 
     def run(self, work: Workspace) -> None:
-        """Set ``work.level``."""
         work.level = self.place(work)
         work.log({"step": self.number, "level": work.level})
 
     def place(self, work: Workspace) -> float:
         """The level."""
         s, source = work.config, work.source
-        assert source is not None
         seed, agent = spawn(work.seed, "level", self.number), work.agent(0.0)
         device = next(work.encoder.parameters()).device
         env = source.make_env(batch_size=[self.envs], seed=seed)

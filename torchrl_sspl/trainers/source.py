@@ -3,48 +3,36 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy
-from torchrl_sspl.data.encoding import encode_transitions
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.modules import make_rollout_policy
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Mixture, Region
 
 _CHUNK = 4096  # transitions whose pictures are held at a time
+_ENCODED = 1000  # and that are encoded at a time
 
 Latents = dict[str, Tensor]
 
 
 def starts_of(env: SafetyEnv, shares: Sequence[float]) -> Region:
-    """Where episodes start: anywhere, outside U, in S and in U, in given shares.
+    """Where episodes start: anywhere, outside U, in S and in U of an environment that knows them, in four given shares.
 
-    Args:
-        env: knows its sets.
-        shares: four numbers.
-
-    Returns the mixture. Source: paper Section IV (S, U and D are sampled apart).
+    Source: paper Section IV (S, U and D are sampled apart).
     """
     return Mixture([env.state_space, env.state_space - env.unsafe_set, env.safe_set, env.unsafe_set], shares)
 
 
 class TrainingStarts:
-    """Environments for training: where the sets are known, episodes start in them in given shares.
-
-    Args:
-        make_env: ``(batch_size=[n], seed=...) -> environment``.
-        batch_size: ``[n]``.
-        shares: see :func:`starts_of`.
-
-    Source: none.
-    """
+    """Environments for training: where the sets are known, episodes start in them as :func:`starts_of` says."""
 
     def __init__(self, make_env: Callable[..., EnvBase], batch_size: list[int], shares: Sequence[float]) -> None:
         self.make_env, self.batch_size, self.shares = make_env, batch_size, list(shares)
@@ -86,14 +74,11 @@ class Source:
         self.make_env, self.encoder, self.store = make_env, getattr(encoder, "module", encoder), store
         self.starts, self.steps, self.envs, self.seed = list(starts), steps, envs, seed
         self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
-        self._env: EnvBase | None = None
 
-    @property
+    @cached_property
     def env(self) -> Any:
         """One environment of the system; for what it knows, not for stepping."""
-        if self._env is None:
-            self._env = self.make_env(batch_size=[1], seed=self.seed)
-        return self._env
+        return self.make_env(batch_size=[1], seed=self.seed)
 
     @property
     def known(self) -> bool:
@@ -114,13 +99,8 @@ class Source:
         self.budget["resets"] += (store.n_frames - n) // 2  # an episode has two frames more than transitions
 
     def stored(self, most: int) -> Latents | None:
-        """Latents of the joint training's transitions.
-
-        Args:
-            most: of more than that, those of S and U first, up to half, and others at random.
-
-        Returns the latents; ``None`` without a store.
-        """
+        """Latents of the joint training's transitions; of more than ``most``, those of S and U first, up to half, and
+        others at random. ``None`` without a store."""
         if self.store is None or not len(self.store):
             return None
         self.count(self.store)
@@ -130,13 +110,12 @@ class Source:
             mixed = torch.randperm(n, generator=torch.Generator().manual_seed(self.seed))
             first = mixed[self.store.region[mixed] != UNLABELLED][: most // 2]
             index = torch.cat([first, mixed[~torch.isin(mixed, first)][: most - len(first)]])
-        return encode_transitions(self._encode, self.store, index)
+        return self._encode(self.store, index)
 
     def random(self, n: int, index: int, *, region: Region | None = None, steps: int | None = None) -> Latents:
         """Latents of n transitions under random actions.
 
         Args:
-            n: how many.
             index: number of this collection within its round's seeds.
             region: where episodes start; by default the shares ``starts``.
             steps: longest episode, in place of the source's.
@@ -175,17 +154,25 @@ class Source:
             store = draw(env, size, spawn(self.seed, "rounds", 1000 * index + k))
             store.pixel_views = not hasattr(self.encoder, "sequence")
             self.count(store)
-            parts.append(encode_transitions(self._encode, store))
+            parts.append(self._encode(store, torch.arange(len(store))))
         if not isinstance(env, SafetyEnv):
             env.close()
         return {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
 
     @torch.no_grad()
-    def _encode(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
+    def _encode(self, store: TransitionStore, index: Tensor) -> Latents:
+        """Latents before and after, actions and regions of some transitions, on the CPU."""
         device = next(self.encoder.parameters()).device
-        if hasattr(self.encoder, "sequence"):
-            return self.encoder.sequence(batch["frames"].to(device)).unbind(1)  # type: ignore[operator]
-        return self.encoder(batch["pixels"].to(device)), self.encoder(batch["next", "pixels"].to(device))
+        parts = []
+        for rows in index.split(_ENCODED):
+            batch = store.get(rows)
+            if hasattr(self.encoder, "sequence"):
+                latent, after = self.encoder.sequence(batch["frames"].to(device)).unbind(1)  # type: ignore[operator]
+            else:
+                latent, after = self.encoder(batch["pixels"].to(device)), self.encoder(batch["next", "pixels"].to(device))
+            parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"]))
+        names = ("latent", "next_latent", "action", "region")
+        return {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
 
 
 __all__ = ["Source", "TrainingStarts", "starts_of"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
@@ -29,27 +29,23 @@ def _without_worst(loss: nn.Module) -> Iterator[None]:
 class SSPLStepper(OptimizationStepper):
     r"""Steps of Algorithm 1: on the total loss, then on :math:`L_M` where the barrier needs it.
 
-    During the warm start only the terms of :math:`L_{SaLaD}` count. What follows it asks for a barrier that is low where
-    the successor is inside: begun before the latents tell S from U, it would pull both below zero for good. With a
-    :class:`~torchrl_sspl.objectives.LipschitzLoss` both steps are followed by a backtracking that
-    keeps the barrier inside the cone in which its bound is certified.
+    During the warm start only the terms of :math:`L_{SaLaD}` count. What follows it asks for a barrier that is low
+    where the successor is inside: begun before the latents tell S from U, it would pull both below zero for good. With
+    a :class:`~torchrl_sspl.objectives.LipschitzLoss` both steps are followed by a backtracking that keeps the barrier
+    inside the cone in which its bound is certified.
 
     Args:
         optimizer: optimiser of the total loss.
         warm_start_steps: steps on the world model alone; -1: all of them.
-        warm_start_error: the warm start goes on until S and U are told apart: until the running mean of ``safe_error`` +
-            ``unsafe_error`` (over about fifty steps) is at most this. Until then the worst rows do not count extra.
+        warm_start_error: the warm start goes on until S and U are told apart: until the running mean of ``safe_error``
+            + ``unsafe_error`` (over about fifty steps) is at most this. Until then the worst rows do not count extra.
             ``None`` goes by the number of steps alone.
-        lipschitz_loss: :math:`L_M`, for an :class:`~torchrl_sspl.lipschitz.LMIBarrier`; ``None`` for
-            barriers that are Lipschitz by construction.
+        lipschitz_loss: :math:`L_M`, for an ``LMIBarrier``; ``None`` for barriers that are Lipschitz by construction.
         lipschitz_optimizer: optimiser of :math:`L_M`; needed with ``lipschitz_loss``.
         autocast: dtype of mixed precision, such as ``torch.bfloat16``; ``None`` for none.
 
-    Returns:
-        ``step`` returns the detached terms and metrics of the losses, ``grad_norm``, ``warm_start`` (1
-        during it) and, with ``lipschitz_loss``, ``lipschitz_share`` (of the last :math:`L_M` step that
-        was kept). The keys do not vary.
-
+    ``step`` returns the detached terms and metrics of the losses, ``grad_norm``, ``warm_start`` (1 during it) and, with
+    ``lipschitz_loss``, ``lipschitz_share`` (of the last :math:`L_M` step that was kept). The keys do not vary.
     Raises ConfigError if only one of ``lipschitz_loss`` and ``lipschitz_optimizer`` is given, the number of steps is
     negative, or the error is not positive. Source: paper, Algorithm 1; deviation: the steps never leave the cone.
 
@@ -78,10 +74,9 @@ class SSPLStepper(OptimizationStepper):
             raise ConfigError(f"expected warm_start_steps >= 0, or -1 for all steps, received {warm_start_steps}")
         if warm_start_error is not None and not warm_start_error > 0:
             raise ConfigError(f"expected warm_start_error > 0 or None, received {warm_start_error}")
-        self.optimizer, self.lipschitz_optimizer = optimizer, lipschitz_optimizer
-        self.lipschitz_loss = lipschitz_loss
-        self.warm_start_steps, self.autocast, self.count = warm_start_steps, autocast, 0
-        self.warm_start_error = warm_start_error
+        self.optimizer, self.lipschitz_optimizer, self.lipschitz_loss = optimizer, lipschitz_optimizer, lipschitz_loss
+        self.warm_start_steps, self.warm_start_error = warm_start_steps, warm_start_error
+        self.autocast, self.count = autocast, 0
         self.mislabelled = 2.0  # running mean of the two errors; both are 1 at worst
 
     @property
@@ -97,14 +92,7 @@ class SSPLStepper(OptimizationStepper):
                 optimizer.state.clear()
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
-        """One step on a batch of transitions.
-
-        Args:
-            trainer: the trainer that runs it; gives loss module and clipping.
-            sub_batch: batch of transitions.
-
-        Returns detached scalars.
-        """
+        """Detached scalars of one step on a batch of transitions; the trainer gives loss module and clipping."""
         blind = self.blind
         warm = blind or self.count < self.warm_start_steps or self.warm_start_steps < 0
         self.count += 1
@@ -121,11 +109,8 @@ class SSPLStepper(OptimizationStepper):
         self._backtrack(before)
         if blind:  # only now: a GPU is waited for here
             self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
-        output = dict(terms.detach().items())
-        output["grad_norm"] = norm.detach()
-        output["warm_start"] = torch.tensor(float(warm))
-        output |= self._lipschitz_step()
-        return TensorDict(output, batch_size=[])
+        extra = {"grad_norm": norm.detach(), "warm_start": torch.tensor(float(warm)), **self._lipschitz_step()}
+        return TensorDict({**dict(terms.detach().items()), **extra}, batch_size=[])
 
     def _clip(self, trainer: Trainer) -> Tensor:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
@@ -172,20 +157,3 @@ class SSPLStepper(OptimizationStepper):
         self.optimizer.load_state_dict(state_dict["optimizer"])
         if self.lipschitz_optimizer is not None:
             self.lipschitz_optimizer.load_state_dict(state_dict["lipschitz_optimizer"])
-
-
-def learnable(modules: Iterable[nn.Module]) -> list[nn.Parameter]:
-    """Trainable parameters of several modules, each once.
-
-    Args:
-        modules: networks or losses, which may share parameters.
-
-    Returns the parameters in the order in which they are met.
-
-    Example:
-        >>> layer = nn.Linear(2, 1)
-        >>> len(learnable([layer, layer]))
-        2
-    """
-    found = {id(p): p for module in modules for p in module.parameters() if p.requires_grad}
-    return list(found.values())

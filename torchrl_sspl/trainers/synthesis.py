@@ -1,11 +1,10 @@
 r"""The phases on frozen latents: data, dynamics, what can be kept, barrier and policy, fine-tuning on the condition.
 
 In each round: :class:`Gather` encodes transitions, :class:`FitDynamics` fits the latent dynamics to them,
-:class:`TeachPolicy` (teacher "value") teaches the policy the values of its actions, :class:`FitSets` regresses barrier and
-policy onto the largest robust invariant set of the cloud of latents (or the margin that the taught policy keeps),
+:class:`TeachPolicy` (teacher "value") teaches the policy the values of its actions, :class:`FitSets` regresses barrier
+and policy onto the largest robust invariant set of the cloud of latents (or the margin that the taught policy keeps),
 :class:`SteerPolicy` and :class:`FineTune` train on the condition
-:math:`B(z) \le 0 \Rightarrow B(d(z, \pi(z)) + e) + m \le 0` under the observed errors e. Checks follow
-(:mod:`torchrl_sspl.trainers.selection`).
+:math:`B(z) \le 0 \Rightarrow B(d(z, \pi(z)) + e) + m \le 0` under the observed errors e. Checks follow.
 """
 
 from __future__ import annotations
@@ -50,16 +49,15 @@ _NEAR = 0.2  # barrier value up to which further rounds look at transitions of t
 class Gather(Phase):
     """Encoded transitions: those of the joint training and random actions in the first round, the policy's own afterwards.
 
-    Where the environment knows its sets, further rounds add transitions of the exploring policy that start in the set or
-    near it, and of many that start in U those whose pictures the present barrier puts lowest: the rim of U is where a set
-    goes wrong first. Elsewhere they add episodes of the exploring policy from the environment's own resets. Source:
-    paper Algorithm 1 (rollouts join D); deviation: which of them are kept is decided by their pictures.
+    Where the environment knows its sets, further rounds add transitions of the exploring policy that start in the set
+    or near it, and of many that start in U those whose pictures the present barrier puts lowest: the rim of U is where
+    a set goes wrong first. Elsewhere they add episodes of the exploring policy from the environment's own resets.
+    Source: paper Algorithm 1 (rollouts join D); deviation: which of them are kept is decided by their pictures.
     """
 
     name = "gather"
 
     def run(self, work: Workspace) -> None:
-        """Extend ``work.latents``."""
         s, source = work.config, work.source
         if source is None:
             return  # they were given
@@ -85,7 +83,6 @@ class Gather(Phase):
 
     def _near_the_set(self, work: Workspace) -> dict[str, Tensor]:
         s, source = work.config, work.source
-        assert source is not None
         region = source.outside_unsafe if source.known else None
         found: list[dict[str, Tensor]] = []
         count = 0
@@ -104,13 +101,22 @@ class Gather(Phase):
     @torch.no_grad()
     def _rim(self, work: Workspace) -> dict[str, Tensor]:
         s, source = work.config, work.source
-        assert source is not None
         drawn = source.random(s.rim_draws * s.rim_transitions, 20 * self.number + 10, region=source.env.unsafe_set, steps=1)
         lowest = work.barrier(drawn["latent"])[:, 0].topk(s.rim_transitions, largest=False).indices
         return {k: v[lowest] for k, v in drawn.items()}
 
 
-class FitDynamics(Phase):
+class _Training(Phase):
+    """Takes ``<name>_steps`` of the configuration; where it refits, half of them in further rounds."""
+
+    refits = True
+
+    def size(self, work: Workspace) -> int:
+        steps = getattr(work.config, f"{self.name}_steps")
+        return steps // 2 if self.refits and self.number else steps
+
+
+class FitDynamics(_Training):
     """Dynamics on frozen latents; off the manifold they lead back to it.
 
     Source: paper eq. (8), third term; deviation: the worst errors count extra, so do latents off the manifold.
@@ -118,13 +124,7 @@ class FitDynamics(Phase):
 
     name = "dynamics"
 
-    def size(self, work: Workspace) -> int:
-        """Half of the steps in further rounds."""
-        steps = work.config.dynamics_steps
-        return steps if self.number == 0 else steps // 2
-
     def run(self, work: Workspace) -> None:
-        """Train ``work.dynamics``."""
         s, data = work.config, work.latents
         tube, base = off_manifold(work, data["latent"], 1.3 * s.tube_radius, self.number)
         on, off = 2 * s.batch // 6, s.batch // 6
@@ -142,7 +142,7 @@ class FitDynamics(Phase):
         work.loop(self.size(work), {work.dynamics: 3e-3 if self.number == 0 else 2e-3}, step)
 
 
-class TeachPolicy(Phase):
+class TeachPolicy(_Training):
     """The policy alone, on the values of its actions; what it then keeps is what the barrier is taught.
 
     Source: none; the paper descends on the barrier.
@@ -150,13 +150,7 @@ class TeachPolicy(Phase):
 
     name = "teach"
 
-    def size(self, work: Workspace) -> int:
-        """Half of the steps in further rounds."""
-        steps = work.config.teach_steps
-        return steps if self.number == 0 else steps // 2
-
     def run(self, work: Workspace) -> None:
-        """Train ``work.policy``, keep a copy in ``work.taught``."""
         s, z, unsafe = work.config, work.latents["latent"], work.unsafe()
         g = torch.Generator().manual_seed(work.seed + 99_000 + self.number)
         actions = action_grid(work.action_scale, s.actions)
@@ -177,7 +171,7 @@ class TeachPolicy(Phase):
         work.taught = copy.deepcopy(work.policy).requires_grad_(False)
 
 
-class FitSets(Phase):
+class FitSets(_Training):
     """Barrier and policy onto the robust invariant set of the encoded data.
 
     Source: none; the paper trains the barrier on the condition from the start.
@@ -185,13 +179,7 @@ class FitSets(Phase):
 
     name = "fit"
 
-    def size(self, work: Workspace) -> int:
-        """Half of the steps in further rounds."""
-        steps = work.config.fit_steps
-        return steps if self.number == 0 else steps // 2
-
     def run(self, work: Workspace) -> None:
-        """Train ``work.barrier`` and ``work.policy``."""
         table, _ = targets(work, self.number)
         loss = TargetLoss(
             work.barrier, work.policy, action_scale=work.action_scale, scale=0.1, worst_coeff=0.3, worst_fraction=0.05
@@ -200,17 +188,13 @@ class FitSets(Phase):
         work.loop(self.size(work), rates, lambda: loss(table[work.loop.pick(len(table), work.config.batch)]))
 
 
-class FineTune(Phase):
+class FineTune(_Training):
     """Barrier and policy together, on the condition under observed errors, the labels and the targets.
 
     Source: paper eq. (10); deviation: condition R3 in place of a decrease everywhere.
     """
 
-    name = "tune"
-
-    def size(self, work: Workspace) -> int:
-        """All of them in every round."""
-        return work.config.tune_steps
+    name, refits = "tune", False
 
     def rates(self, work: Workspace) -> dict[nn.Module, float]:
         """What is trained, with its peak learning rate."""
@@ -221,7 +205,6 @@ class FineTune(Phase):
         return config.margin
 
     def run(self, work: Workspace) -> None:
-        """Train on the condition."""
         s = work.config
         table, rim = targets(work, self.number)
         unsafe = (table["region"][:, 0] == UNSAFE).nonzero()[:, 0]
@@ -283,16 +266,10 @@ class SteerPolicy(FineTune):
 
     name = "steer"
 
-    def size(self, work: Workspace) -> int:
-        """All of them in every round."""
-        return work.config.steer_steps
-
     def rates(self, work: Workspace) -> dict[nn.Module, float]:
-        """The policy."""
         return {work.policy: 3e-3}
 
     def margin(self, config: SynthesisConfig) -> float:
-        """Twice m."""
         return 2 * config.margin
 
 
@@ -301,8 +278,7 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
 
     Args:
         config: gives the number of rounds and the teacher.
-        check: ``round -> phase`` that ends every round, such as
-            :class:`~torchrl_sspl.trainers.selection.CheckRound`; ``None``: nothing is checked.
+        check: ``round -> phase`` that ends every round, such as :class:`CheckRound`; ``None``: nothing is checked.
 
     Returns the phases in order; leave some out, or put your own between them. Source: paper Algorithm 1.
 
@@ -315,21 +291,10 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
     return [kind(k) for k in range(config.rounds) for kind in kinds]
 
 
-# ---------------------------------------------------------------------- targets
-
-
 def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
-    """A regular grid of actions, coarser where many dimensions would make it too large.
+    """``(k, m)``, a regular grid of actions up to a scale per dimension, coarser where many would make it too large.
 
-    Args:
-        action_scale: largest action per dimension, physical units.
-        per_dimension: actions per dimension.
-
-    Returns ``(k, m)``. Raises ConfigError if the action has too many dimensions. Source: none.
-
-    Example:
-        >>> action_grid([2.0], 3)[:, 0].tolist()
-        [-2.0, 0.0, 2.0]
+    Raises ConfigError if the action has too many dimensions. Source: none.
     """
     m = len(action_scale)
     k = max(2, min(per_dimension, int(_MOST_ACTIONS ** (1 / m) + 1e-6)))
@@ -470,13 +435,4 @@ def _value_targets(work: Workspace, queries: Tensor, errors: Tensor) -> tuple[Te
     return target, target <= 0, action, torch.ones(len(z))
 
 
-__all__ = [
-    "FineTune",
-    "FitDynamics",
-    "FitSets",
-    "Gather",
-    "SteerPolicy",
-    "TeachPolicy",
-    "action_grid",
-    "synthesis_phases",
-]
+__all__ = ["FineTune", "FitDynamics", "FitSets", "Gather", "SteerPolicy", "TeachPolicy", "action_grid", "synthesis_phases"]

@@ -41,13 +41,12 @@ class _RNGState(GlobalRNGState):
 class SSPLTrainer(Trainer):
     r"""Algorithm 1 on TorchRL's trainer.
 
-    Per collected batch: store it; re-estimate the margins; ``optim_steps_per_batch`` steps on the
-    total loss (and on :math:`L_M` where the barrier needs it), each followed by the target-network
-    update; hand the new weights to the collector; evaluate, draw, check whether to stop; save. When all
-    transitions are collected, the ``phases`` follow. With ``checkpoint_dir`` a run that was killed at any
-    moment continues from its last complete checkpoint through :meth:`resume`, and on one CPU process ends
-    with the very weights of a run that was never killed, if the collector resets at each iteration
-    (``reset_at_each_iter=True``).
+    Per collected batch: store it; re-estimate the margins; ``optim_steps_per_batch`` steps on the total loss (and on
+    :math:`L_M` where the barrier needs it), each followed by the target-network update; hand the new weights to the
+    collector; evaluate, draw, check whether to stop; save. When all transitions are collected, the ``phases`` follow.
+    With ``checkpoint_dir`` a run that was killed at any moment continues from its last complete checkpoint through
+    :meth:`resume`, and on one CPU process ends with the very weights of a run that was never killed, if the collector
+    resets at each iteration (``reset_at_each_iter=True``).
 
     Args:
         collector: TorchRL collector.
@@ -58,29 +57,24 @@ class SSPLTrainer(Trainer):
         optim_steps_per_batch: steps per collected batch.
         frame_skip: environment steps per transition.
         warm_start_steps: steps on the world model alone, before everything else counts; -1: all of them.
-        warm_start_error: share of S and U on the wrong side down to which the warm start goes on; ``None`` goes by the
-            steps alone.
-        target_net_updater: updater of :math:`\theta^-`; needed if and only if the loss has delayed networks.
-            ``None`` gives ``SoftUpdate(loss_module, tau=0.01)`` then.
-        lipschitz_loss: :math:`L_M`, for an ``LMIBarrier``.
-        lipschitz_optimizer: its optimiser.
+        warm_start_error: share of S and U on the wrong side down to which it goes on; ``None`` goes by the steps alone.
+        target_net_updater: updater of :math:`\theta^-`, for a loss with delayed networks alone; ``None`` gives
+            ``SoftUpdate(loss_module, tau=0.01)`` then.
+        lipschitz_loss, lipschitz_optimizer: :math:`L_M` for an ``LMIBarrier``, and its optimiser.
         margins: re-estimates the margins; ``None`` keeps those of the loss.
         rollout_policy: policy of the collector in other processes; by default encoder and policy of the loss.
-        evaluate: ``trainer -> mapping of floats``, logged; the entry ``"stop"`` (a text) ends the training.
-        evaluate_every: collected batches between evaluations.
-        draw: ``trainer -> mapping of names to figures``, given to the logger.
-        draw_every: collected batches between drawings.
+        evaluate, evaluate_every: ``trainer -> mapping of floats``, logged after so many batches; the entry ``"stop"``
+            (a text) ends the training.
+        draw, draw_every: ``trainer -> mapping of names to figures``, given to the logger after so many batches.
         checkpoint_dir: folder of the checkpoints; ``None`` for none.
-        checkpoint_seconds: seconds between checkpoints, in the joint training and in the phases; 0 saves after every
-            batch, and after every step of a phase.
+        checkpoint_seconds: seconds between checkpoints; 0 saves after every batch, and after every step of a phase.
         keep_checkpoints: number of checkpoints that are kept.
         autocast: dtype of mixed precision.
-        phases: what follows when all transitions are collected; see
-            :class:`~torchrl_sspl.trainers.phases.Phases`.
+        phases: what follows when all transitions are collected.
         out_dir: where ``log.jsonl`` is written; ``None``: nowhere.
         progress_bar: show one bar over the joint training and the phases.
-        **trainer_options: further arguments of ``torchrl.trainers.Trainer``, such as ``logger``,
-            ``clip_norm``, ``log_interval``, ``seed``.
+        **trainer_options: of ``torchrl.trainers.Trainer``, such as ``logger``, ``clip_norm``, ``log_interval``,
+            ``seed``.
 
     Raises ConfigError if the loss is no ``SSPLLoss``, or arguments do not go together. Source: paper, Algorithm 1;
     deviations: see the loss and the hooks.
@@ -96,13 +90,11 @@ class SSPLTrainer(Trainer):
         >>> salad = SaLaD.from_sizes(2, 1, action_scale=env.max_action, pool_to=8)
         >>> policy = Policy(2, 1, action_scale=env.max_action)
         >>> loss = SSPLLoss(*salad, policy)
-        >>> options = {"reset_at_each_iter": True, "auto_register_policy_transforms": False}
-        >>> collector = Collector(env, make_rollout_policy(salad, policy), frames_per_batch=64,
-        ...                       total_frames=128, **options)
+        >>> collector = Collector(env, make_rollout_policy(salad, policy), frames_per_batch=64, total_frames=128,
+        ...                       reset_at_each_iter=True, auto_register_policy_transforms=False)
         >>> trainer = SSPLTrainer(collector=collector, total_frames=128, loss_module=loss,
-        ...                       optimizer=torch.optim.Adam(loss.parameters(), 1e-3),
-        ...                       replay_buffer=TransitionStore(256).replay_buffer(16),
-        ...                       optim_steps_per_batch=2, progress_bar=False)
+        ...                       optimizer=torch.optim.Adam(loss.parameters(), 1e-3), optim_steps_per_batch=2,
+        ...                       replay_buffer=TransitionStore(256).replay_buffer(16), progress_bar=False)
         >>> trainer.train()
         >>> trainer.collected_frames
         128
@@ -140,13 +132,9 @@ class SSPLTrainer(Trainer):
     ) -> None:
         target_net_updater = self._checked(loss_module, target_net_updater, trainer_options)
         stepper = SSPLStepper(
-            optimizer,
-            warm_start_steps=warm_start_steps,
-            warm_start_error=warm_start_error,
-            lipschitz_loss=lipschitz_loss,
-            lipschitz_optimizer=lipschitz_optimizer,
-            autocast=autocast,
-        )
+            optimizer, warm_start_steps=warm_start_steps, warm_start_error=warm_start_error, lipschitz_loss=lipschitz_loss,
+            lipschitz_optimizer=lipschitz_optimizer, autocast=autocast,
+        )  # fmt: skip
         if checkpoint_dir is not None:
             trainer_options |= {
                 # In name order the generator comes after what might draw from it, the collector.
@@ -155,19 +143,12 @@ class SSPLTrainer(Trainer):
             }
         self.checkpoint_seconds, self._saved_at = checkpoint_seconds, time.monotonic()
         super().__init__(
-            collector=collector,
-            total_frames=total_frames,
-            frame_skip=frame_skip,
-            optim_steps_per_batch=optim_steps_per_batch,
-            loss_module=loss_module,
-            optimization_stepper=stepper,
-            replay_buffer=replay_buffer,
-            target_net_updater=target_net_updater,
-            progress_bar=False,
-            **trainer_options,
-        )
+            collector=collector, total_frames=total_frames, frame_skip=frame_skip, loss_module=loss_module,
+            optim_steps_per_batch=optim_steps_per_batch, optimization_stepper=stepper, replay_buffer=replay_buffer,
+            target_net_updater=target_net_updater, progress_bar=False, **trainer_options,
+        )  # fmt: skip
         self.phases, self.clock, self.show_progress, self.resumed = phases, ClockHook(), progress_bar, False
-        self._register(replay_buffer, margins, rollout_policy, out_dir)
+        self._register(replay_buffer, margins, rollout_policy, None if out_dir is None else Path(out_dir) / LOG_FILE)
         if evaluate is not None:
             EveryHook(self, evaluate, every=evaluate_every).register(self, "evaluate")
         if draw is not None:
@@ -195,11 +176,7 @@ class SSPLTrainer(Trainer):
         return SoftUpdate(loss, tau=0.01) if delayed and updater is None else updater
 
     def _register(
-        self,
-        replay_buffer: ReplayBuffer,
-        margins: MarginHook | None,
-        rollout_policy: TensorDictModuleBase | None,
-        out_dir: str | os.PathLike[str] | None,
+        self, replay_buffer: Any, margins: MarginHook | None, rollout_policy: TensorDictModuleBase | None, log: Path | None
     ) -> None:
         """The hooks of the joint training, in the order in which they act."""
         loss, device = self.loss_module, self.loss_module.safety_margin.device
@@ -222,10 +199,8 @@ class SSPLTrainer(Trainer):
             margins.register(self)
         SeedHook(self.collector).register(self)
         self.clock.register(self)
-        LogHook(None if out_dir is None else Path(out_dir) / LOG_FILE).register(self)
+        LogHook(log).register(self)
         self.register_op("post_optim", self._tick)
-
-    # ------------------------------------------------------------------ running
 
     def train(self) -> None:
         """Train, or continue to train, to the end: the joint training, then the phases."""
@@ -284,10 +259,10 @@ class SSPLTrainer(Trainer):
         return None
 
     def resume(self) -> bool:
-        """Continues from the newest complete checkpoint, if there is one.
+        """Continues from the newest complete checkpoint; whether there is one.
 
-        Returns whether there was one. Raises ConfigError if the trainer has no ``checkpoint_dir``; CheckpointError if
-        the checkpoint cannot be read or does not fit.
+        Raises ConfigError without a ``checkpoint_dir``; CheckpointError if the checkpoint cannot be read or does not
+        fit.
         """
         rotation = self.checkpoint_rotation
         if rotation is None:
