@@ -82,8 +82,8 @@ class Experiment:
             what ``config.network`` describes.
         title: title of the report; by default the system's.
 
-    Raises ConfigError if values of the configuration do not go together, or the environment lacks labels. Source:
-    paper, Algorithm 1, on TorchRL's trainer.
+    Raises ConfigError if values of the configuration do not go together, or the environment lacks labels.
+    Source: paper, Algorithm 1, on TorchRL's trainer.
     """
 
     def __init__(
@@ -196,26 +196,30 @@ class Experiment:
             lipschitz["lipschitz_loss"] = LipschitzLoss(self.barrier)
             lipschitz["lipschitz_optimizer"] = torch.optim.Adam(self.barrier.parameters(), config.optim.lr)
         bound = config.network.lipschitz_bound
-        as_set = ("total_frames", "optim_steps_per_batch", "warm_start_steps", "warm_start_error", "checkpoint_seconds",
-                  "keep_checkpoints", "clip_norm")  # fmt: skip
         trainer = SSPLTrainer(
             collector=self._collector(rollout_policy),
+            total_frames=t.total_frames,
             loss_module=self.loss,
             optimizer=optimizer,
             replay_buffer=buffer,
+            optim_steps_per_batch=t.optim_steps_per_batch,
+            warm_start_steps=t.warm_start_steps,
+            warm_start_error=t.warm_start_error,
             target_net_updater=SoftUpdate(self.loss, tau=config.optim.target_tau) if delayed else None,
             rollout_policy=rollout_policy,
             margins=MarginHook(self.loss, buffer, lipschitz_bound=bound) if t.margins else None,
             evaluate=self._evaluate_during if t.evaluate_every else None,
             evaluate_every=max(1, t.evaluate_every),
             checkpoint_dir=self.directory / "checkpoints" if t.checkpoint_seconds >= 0 else None,
+            checkpoint_seconds=t.checkpoint_seconds,
+            keep_checkpoints=t.keep_checkpoints,
             autocast=None if t.autocast == "none" else getattr(torch, t.autocast),
             phases=self.phases,
             out_dir=self.directory,
             progress_bar=t.progress,
+            clip_norm=t.clip_norm,
             logger=self.logger,
             log_interval=0,
-            **{name: getattr(t, name) for name in as_set},
             **lipschitz,
         )
         if t.restarts and t.warm_start_error is not None and t.warm_start_steps > 0:
@@ -235,11 +239,11 @@ class Experiment:
 
     def _collector(self, policy: Any) -> Any:
         c = self.config.collector
-        as_set = ("backend", "workers", "frames_per_batch", "max_frames_per_traj", "ray_address")
         return make_collector(
-            TrainingStarts(self.make_env, [c.envs], c.starts), policy, total_frames=self.config.trainer.total_frames,
-            init_random_frames=self.config.random_frames(), policy_device=self.device, seed=self.config.seed,
-            **{name: getattr(c, name) for name in as_set},
+            TrainingStarts(self.make_env, [c.envs], c.starts), policy, backend=c.backend, workers=c.workers,
+            frames_per_batch=c.frames_per_batch, total_frames=self.config.trainer.total_frames,
+            init_random_frames=self.config.random_frames(), max_frames_per_traj=c.max_frames_per_traj,
+            policy_device=self.device, ray_address=c.ray_address, seed=self.config.seed,
         )  # fmt: skip
 
     def _evaluate_during(self, trainer: SSPLTrainer) -> dict[str, Any]:

@@ -155,8 +155,8 @@ def sweep(
         command: what is called with the words of each run.
 
     Returns what was done; ``sweep.json`` and ``comparison.html`` are on disk. Raises ConfigError if a configuration is
-    not valid, before anything is started, and MissingDependencyError if Ray is asked for and not installed. Source:
-    none.
+    not valid, before anything is started, and MissingDependencyError if Ray is asked for and not installed.
+    Source: none.
     """
     if launcher not in LAUNCHERS:
         raise ConfigError(f"expected --launcher to be one of {', '.join(LAUNCHERS)}, received '{launcher}'")
