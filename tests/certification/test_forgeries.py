@@ -104,7 +104,7 @@ def regenerated(change: Callable[[Body], None]) -> Callable[[Body], None]:
         record = Record.from_dict(body["record"])
         found = (s["value"] for s in body["layers"]["deterministic"]["statements"] if s["name"] == "tolerated error")
         tolerated = next(found, None)
-        layers = statistical_layer(record, level=body["level"], tolerated_error=tolerated), paper_layer(record, 1.5)
+        layers = statistical_layer(record, tolerated_error=tolerated), paper_layer(record, 1.5)
         for layer in layers:
             body["layers"][layer.name] = json.loads(json.dumps({"name": layer.name, "statements": [vars(s) for s in layer.statements], "verdict": layer.verdict}))
 

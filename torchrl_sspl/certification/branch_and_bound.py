@@ -1,15 +1,10 @@
-r"""Branch and bound over a box: the largest value of an objective where a constraint holds, from both sides.
+r"""Branch and bound: the largest :math:`\min_k (R_k F(z) - b_k B(z) + c_k)` where :math:`c_- \le B(z) \le c_+`.
 
-All claims of the deterministic layer are of one form: the maximum, over the :math:`z \in Z` with
-:math:`c_- \le B(z) \le c_+`, of
-
-.. math:: \min_k \; (R_k F(z) - b_k B(z) + c_k)
-
-with F the closed loop :math:`z \mapsto B(d(z, \pi(z)))` (or :math:`d(z, \pi(z))` itself). A box is discarded as soon as
-one of these, tried in the order of their cost, shows that it is of no interest: the Lipschitz constant of B around its
-centre; linear bounds of B; the enclosure of :math:`d(z, \pi(z))` with the Lipschitz constant; linear bounds of F. The
-last two functions are used together: the linear programme "objective where B is at most :math:`c_+`" is solved exactly,
-and both half-spaces cut the box before it is split.
+F is the closed loop :math:`z \mapsto B(d(z, \pi(z)))` (or :math:`d(z, \pi(z))` itself); all claims of the deterministic
+layer are of this form. A box is discarded as soon as one of these, in the order of their cost, shows that it is of no
+interest: the Lipschitz constant of B around its centre; linear bounds of B; the enclosure of :math:`d(z, \pi(z))` with
+    the Lipschitz constant; linear bounds of F. The last two functions are used together: the linear programme
+    "objective where B is at most :math:`c_+`" is solved exactly, and both half-spaces cut the box before it is split.
 """
 
 from __future__ import annotations
@@ -18,7 +13,6 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import cast
 
 import torch
 from torch import Tensor
@@ -31,18 +25,16 @@ from torchrl_sspl.errors import ConfigError
 
 #: What a bound or a witness must be better by before it decides; far above the rounding of float64.
 SLACK = 1e-6
+_BATCH = 1024  # boxes at a time
 
 
 @dataclass(frozen=True)
 class Budget:
-    """When a search gives up.
+    """When a search gives up; negative numbers raise ``ConfigError``.
 
     Attributes:
         boxes: number of boxes; when it runs out the result is the same on every machine.
         seconds: wall-clock time.
-
-    Raises:
-        ConfigError: if one of them is negative.
 
     Source: none.
     """
@@ -57,35 +49,20 @@ class Budget:
 
 @dataclass
 class Problem:
-    """What is maximised, and where.
+    """What is maximised, and where; points are ``(n, p)`` float64."""
 
-    Attributes:
-        low: lower corner of the domain, ``(p,)`` float64.
-        high: upper corner, ``(p,)`` float64.
-        function: F, ``(n, p) -> (n, q)``.
-        rows: R, ``(K, q)``; nonnegative where ``inner`` is given.
-        barrier: B, ``(n, p) -> (n, 1)``.
-        barrier_weight: b, ``(K,)``, nonnegative.
-        constant: c, ``(K,)``.
-        level: :math:`c_+`, or None.
-        floor: :math:`c_-`, or None.
-        combine: "min" or "max" of the rows.
-        lipschitz: proved Lipschitz constant of B, or None.
-        inner: step of F that holds :math:`d(z, \\pi(z))` where F ends with B, else None.
-    """
-
-    low: Tensor
+    low: Tensor  # corners of the domain, (p,)
     high: Tensor
-    function: Graph
-    rows: Tensor
-    barrier: Graph
-    barrier_weight: Tensor
-    constant: Tensor
-    level: float | None = None
-    floor: float | None = None
-    combine: str = "min"
-    lipschitz: float | None = None
-    inner: int | None = None
+    function: Graph  # F, (n, p) -> (n, q)
+    rows: Tensor  # R, (K, q); nonnegative where ``inner`` is given
+    barrier: Graph  # B, (n, p) -> (n, 1)
+    barrier_weight: Tensor  # b, (K,), nonnegative
+    constant: Tensor  # c, (K,)
+    level: float | None = None  # c_+
+    floor: float | None = None  # c_-
+    combine: str = "min"  # or "max", of the rows
+    lipschitz: float | None = None  # proved Lipschitz constant of B
+    inner: int | None = None  # step of F that holds d(z, pi(z)) where F ends with B
 
     @property
     def constrained(self) -> bool:
@@ -116,8 +93,7 @@ class Outcome:
     """Result of a search.
 
     Attributes:
-        status: "proved" (the objective is at most ``upper`` everywhere), "refuted" (``witness`` shows the contrary) or
-            "undecided" (the budget was too small).
+        status: "proved" (it is at most ``upper``), "refuted" (by ``witness``) or "undecided" (budget too small).
         upper: the objective is at most this wherever the constraint holds, whatever the status.
         lower: largest value that was found.
         witness: where it was found, ``(p,)``, or None.
@@ -137,24 +113,9 @@ class Outcome:
     depth: int
 
 
-def attack(
-    problem: Problem, *, samples: int = 32768, steps: int = 40, starts: int = 256, seed: int = 0
-) -> tuple[float, Tensor | None]:
-    """Looks for a point with a large objective: uniform samples, then projected gradient ascent from the best.
-
-    Args:
-        problem: what is maximised.
-        samples: number of samples.
-        steps: number of steps of the ascent.
-        starts: number of points that ascend.
-        seed: of the samples.
-
-    Returns:
-        Largest value found where the constraint holds, and the point ``(p,)``; -inf and None if there is no such point.
-
-    Source: none.
-    """
-    generator = torch.Generator().manual_seed(seed)
+def _attack(problem: Problem, samples: int = 32768, starts: int = 256) -> tuple[float, Tensor | None]:
+    """Largest value that samples, and ascent from the best, find where the constraint holds, and its point ``(p,)``."""
+    generator = torch.Generator().manual_seed(0)
     span = problem.high - problem.low
     points = problem.low + span * torch.rand(samples, len(span), generator=generator, dtype=span.dtype)
     with torch.no_grad():
@@ -163,22 +124,11 @@ def attack(
         # The set may be small: where no sample lies in it, start from the deepest points.
         small = problem.level is not None and not inside.any()
         score = -barrier if small else torch.where(inside, value, -math.inf)
-    return ascend(problem, points[score.topk(min(starts, samples)).indices], steps=steps)
+    return _ascend(problem, points[score.topk(starts).indices])
 
 
-def ascend(problem: Problem, start: Tensor, *, steps: int = 40) -> tuple[float, Tensor | None]:
-    """Projected gradient ascent of the objective, pulled back where the constraint fails.
-
-    Args:
-        problem: what is maximised.
-        start: ``(n, p)``.
-        steps: number of steps.
-
-    Returns:
-        Largest value met where the constraint holds, and the point ``(p,)``; -inf and None if there was none.
-
-    Source: none.
-    """
+def _ascend(problem: Problem, start: Tensor, steps: int = 40) -> tuple[float, Tensor | None]:
+    """Projected gradient ascent from ``(n, p)``, pulled back where the constraint fails; -inf, None if always."""
     best, where = -math.inf, None
     span = problem.high - problem.low
     point = start
@@ -244,24 +194,24 @@ class _Boxes:
         return float((self.high - self.low).prod(1).sum()) / self.domain
 
 
-def _infeasible(problem: Problem, least: Tensor, most: Tensor, slack: float) -> Tensor:
+def _infeasible(problem: Problem, least: Tensor, most: Tensor) -> Tensor:
     """Whether no point of a box with B in ``[least, most]`` meets the constraint."""
     out = torch.zeros_like(least, dtype=torch.bool)
     if problem.level is not None:
-        out |= least > problem.level + slack
+        out |= least > problem.level + SLACK
     if problem.floor is not None:
-        out |= most < problem.floor - slack
+        out |= most < problem.floor - SLACK
     return out
 
 
 def _bound(
-    q: Problem, low: Tensor, high: Tensor, threshold: float, slack: float, tight: bool
+    q: Problem, low: Tensor, high: Tensor, threshold: float, tight: bool
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """What is left of boxes: corners, upper bounds, sensitivity per axis, and which of the given boxes it was.
 
     A comparison with a bound that is not a number keeps the box.
     """
-    limit = threshold - slack
+    limit = threshold - SLACK
     kept = torch.arange(len(low))
     constraints: list[LinearBound] = []  # functions that are at most zero wherever the constraint holds
     below = None  # above -B
@@ -269,18 +219,18 @@ def _bound(
         if q.lipschitz is not None and q.constrained:
             value = q.barrier(0.5 * (low + high))[:, 0]
             reach = q.lipschitz * (0.5 * (high - low)).norm(dim=1)
-            keep = ~_infeasible(q, value - reach, value + reach, slack)
+            keep = ~_infeasible(q, value - reach, value + reach)
             low, high, kept = low[keep], high[keep], kept[keep]
         box = Enclosure(q.barrier, low, high, tight=tight)
         both = box.upper(torch.tensor([[-1.0], [1.0]], dtype=torch.float64))
         ends = both.upper(box.radius)
-        keep = ~_infeasible(q, -ends[:, 0], ends[:, 1], slack)
+        keep = ~_infeasible(q, -ends[:, 0], ends[:, 1])
         low, high, kept, both = low[keep], high[keep], kept[keep], both.select(keep)
         below, above_b = (LinearBound(both.slope[:, k : k + 1], both.value[:, k : k + 1], both.center) for k in (0, 1))
         if q.level is not None:
-            constraints.append(LinearBound(-below.slope, -below.value - q.level - slack, below.center))
+            constraints.append(LinearBound(-below.slope, -below.value - q.level - SLACK, below.center))
         if q.floor is not None:
-            constraints.append(LinearBound(-above_b.slope, q.floor - slack - above_b.value, above_b.center))
+            constraints.append(LinearBound(-above_b.slope, q.floor - SLACK - above_b.value, above_b.center))
         for c in constraints:
             low, high = clip(low, high, c)
 
@@ -324,12 +274,8 @@ def maximise(
     problem: Problem,
     *,
     threshold: float | None = None,
-    stop_above: float = math.inf,
     tolerance: float = 1e-3,
     budget: Budget | None = None,
-    slack: float = SLACK,
-    batch: int = 1024,
-    seed: int = 0,
     tight: bool = False,
     confirm: Callable[[Tensor], bool] | None = None,
     progress: bool = False,
@@ -337,26 +283,19 @@ def maximise(
 ) -> Outcome:
     """Largest objective where the constraint holds, or a proof that it does not exceed a threshold.
 
-    With a threshold the search ends as soon as that is proved or refuted; a maximum that lies within the slack of it is
+    With a threshold the search ends as soon as that is proved or refuted; a maximum within :data:`SLACK` of it is
     neither. Without one it closes in on the maximum from both sides until they are no more than the tolerance apart.
+    The outcome is the same for the same arguments unless the time runs out.
 
     Args:
         problem: what is maximised.
         threshold: value to prove.
-        stop_above: end, "refuted", as soon as a value above this is found (without a threshold).
         tolerance: largest distance of the two sides in the end (without a threshold).
         budget: when to give up.
-        slack: what a bound or a witness must be better by before it decides.
-        batch: boxes at a time.
-        seed: of the samples.
         tight: backward bounds for all undecided activations.
-        confirm: whether a point ``(p,)`` is a counterexample for the networks as they are deployed too; a point that is
-            none does not refute.
+        confirm: whether a point ``(p,)`` is a counterexample of the deployed networks too; only then it refutes.
         progress: show a progress bar.
         seek: look for points with a large objective; without it nothing is refuted, and the bounds have to do it alone.
-
-    Returns:
-        The outcome; the same for the same arguments unless the time runs out.
 
     Source: none (branch and bound).
 
@@ -365,13 +304,12 @@ def maximise(
         >>> _ = graph.linear([0], [torch.tensor([[2.0]])])
         >>> one = torch.ones(1, 1, dtype=torch.float64)
         >>> problem = Problem(-one[0], one[0], graph, one, graph, zero, zero, level=0.5)  # 2 z where 2 z <= 0.5
-        >>> outcome = maximise(problem)
-        >>> outcome.status, abs(outcome.upper - 0.5) < 2e-3
-        ('proved', True)
+        >>> maximise(problem).upper < 0.502
+        True
     """
     budget = budget or Budget()
-    search = _Search(problem, threshold, stop_above, tolerance, slack, confirm, seek)
-    search.lower, search.witness = attack(problem, seed=seed) if seek else (-math.inf, None)
+    search = _Search(problem, threshold, tolerance, confirm, seek)
+    search.lower, search.witness = _attack(problem) if seek else (-math.inf, None)
     bar = tqdm(total=1.0, disable=not progress, bar_format="{l_bar}{bar}| {n:.4f} of the domain [{elapsed}<{remaining}]")
     with bar:
         if search.refuted():
@@ -379,7 +317,7 @@ def maximise(
         while len(search.left):
             if search.count >= budget.boxes or search.seconds() >= budget.seconds:
                 return search.outcome("undecided")
-            if search.advance(min(batch, budget.boxes - search.count), tight):
+            if search.advance(min(_BATCH, budget.boxes - search.count), tight):
                 return search.outcome("refuted")
             if progress:
                 bar.n = max(0.0, 1.0 - search.left.volume())
@@ -387,26 +325,23 @@ def maximise(
     return search.outcome("undecided" if search.close else "proved")
 
 
+@dataclass
 class _Search:
     """Where a search stands; the arguments are those of :func:`maximise`."""
 
-    def __init__(
-        self,
-        problem: Problem,
-        threshold: float | None,
-        stop_above: float,
-        tolerance: float,
-        slack: float,
-        confirm: Callable[[Tensor], bool] | None,
-        seek: bool,
-    ) -> None:
-        self.problem, self.threshold, self.tolerance = problem, threshold, tolerance
-        self.slack, self.confirm, self.seek = slack, confirm, seek
-        self.limit = stop_above if threshold is None else threshold + slack
+    problem: Problem
+    threshold: float | None
+    tolerance: float
+    confirm: Callable[[Tensor], bool] | None
+    seek: bool
+    lower: float = -math.inf
+    witness: Tensor | None = None
+    count: int = 0
+    deepest: int = 0
+
+    def __post_init__(self) -> None:
         self.start = time.monotonic()
-        self.left = _Boxes(problem.low, problem.high)
-        self.lower, self.witness = -math.inf, cast("Tensor | None", None)
-        self.count = self.deepest = 0
+        self.left = _Boxes(self.problem.low, self.problem.high)
         self.close: list[float] = []  # volumes of the boxes on which the maximum lies within the slack of the threshold
 
     @property
@@ -418,25 +353,26 @@ class _Search:
         return time.monotonic() - self.start
 
     def refuted(self) -> bool:
-        witness = self.witness
-        return self.lower > self.limit and witness is not None and (self.confirm is None or self.confirm(witness))
+        if self.threshold is None or self.witness is None or not self.lower > self.threshold + SLACK:
+            return False
+        return self.confirm is None or self.confirm(self.witness)
 
     def outcome(self, status: str) -> Outcome:
-        upper, volume = self.goal + (self.slack if self.close else 0.0), self.left.volume() + sum(self.close)
+        upper, volume = self.goal + (SLACK if self.close else 0.0), self.left.volume() + sum(self.close)
         if len(self.left):
-            upper = max(upper, float(self.left.upper.max()) + self.slack)
+            upper = max(upper, float(self.left.upper.max()) + SLACK)
         return Outcome(status, upper, self.lower, self.witness, self.count, self.seconds(), volume, self.deepest)
 
     def advance(self, n: int, tight: bool) -> bool:
         """Bounds the n boxes with the highest bounds and splits what is left of them; whether that refuted."""
         low, high, depth = self.left.take(n)
         self.count += len(low)
-        low, high, upper, sensitivity, kept = _bound(self.problem, low, high, self.goal, self.slack, tight)
+        low, high, upper, sensitivity, kept = _bound(self.problem, low, high, self.goal, tight)
         rest: tuple[Tensor, ...] = (low, high, upper, depth[kept], sensitivity)
         if len(low) and self.seek:
             value = self.look(0.5 * (low + high))
             if self.threshold is not None and not self.refuted():  # neither side can decide here, however often it is cut
-                stuck = (upper <= self.threshold + self.slack) & (value > self.threshold - self.slack)
+                stuck = (upper <= self.threshold + SLACK) & (value > self.threshold - SLACK)
                 self.close += ((high - low)[stuck].prod(1) / self.left.domain).tolist()
                 rest = tuple(t[~stuck] for t in rest)
         if len(rest[0]):
@@ -445,12 +381,12 @@ class _Search:
         return self.refuted()
 
     def look(self, center: Tensor) -> Tensor:
-        """Objective at these points, -inf where the constraint fails; ascends from the best if one is better than all before."""
+        """Objective at points, -inf where the constraint fails; ascends from them if one is better than all before."""
         value, barrier = self.problem.evaluate(center)
         value = torch.where(self.problem.feasible(barrier), value, -math.inf)
         if float(value.max()) > self.lower:
             self.lower, self.witness = float(value.max()), center[int(value.argmax())].clone()
-            better, place = ascend(self.problem, center[value.topk(min(32, len(value))).indices], steps=20)
+            better, place = _ascend(self.problem, center[value.topk(min(32, len(value))).indices], steps=20)
             if better > self.lower:
                 self.lower, self.witness = better, place
         return value

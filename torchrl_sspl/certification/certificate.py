@@ -1,9 +1,9 @@
-r"""The certificate: what was proved, what was measured with which confidence, what is assumed, and what fails.
+"""The certificate: what was proved, what was measured with which confidence, what is assumed, and what fails.
 
-It has three layers. The *paper* layer holds the paper's margins and on what share of samples its conditions hold with
-them. The *deterministic* layer is about the frozen networks alone and follows from their weights: anybody can compute it
-again. The *statistical* layer is about fresh episodes and holds with a confidence. A certificate is never one boolean;
-every statement that does not hold is refused with a reason and with how far it misses.
+The *paper* layer holds the paper's margins and on what share of samples its conditions hold with them. The
+*deterministic* layer is about the frozen networks alone: anybody can compute it again from the weights. The
+*statistical* layer is about fresh episodes and holds with a confidence. Every statement that does not hold is refused
+with a reason and how far it misses.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ SCHEMA = 2
 #: What a statement is; what is reported has a number and no verdict, and what is assumed has neither.
 PROVED, MEASURED, REPORTED, ASSUMED = "proved", "measured", "reported", "assumed"
 KINDS = (PROVED, MEASURED, REPORTED, ASSUMED)
-LAYERS = ("deterministic", "statistical", "paper")
 _BYTES, _DEPTH, _TEXT = 1_000_000, 8, 2000  # of a file; of its nesting; of one text
 
 
@@ -116,11 +115,7 @@ class Statement:
 
     @classmethod
     def from_dict(cls, body: Any) -> Statement:
-        """Reads plain values, each of exactly the type that a statement writes.
-
-        Raises:
-            CertificationError: if one is not.
-        """
+        """Reads plain values, each of exactly the type that a statement writes, else ``CertificationError``."""
         body = keys("a statement", body, [f.name for f in fields(cls)])
         for name in ("name", "text", "kind", "unit", "reason", "detail"):
             if type(body[name]) is not str or len(body[name]) > _TEXT or not body[name].isprintable():
@@ -164,6 +159,13 @@ class Layer:
     def reasons(self) -> list[Reason]:
         """Why it does not hold, without repetition."""
         return list(dict.fromkeys(Reason[s.reason] for s in self.statements if s.reason))
+
+    def state(
+        self, kind: str, name: str, text: str, holds: bool | None = None, reason: Reason | None = None, **more: Any
+    ) -> None:
+        """Adds a statement; the reason is why it does not hold, if it does not."""
+        code = "" if holds or reason is None else reason.name
+        self.statements.append(Statement(name, text, kind, holds, reason=code, **more))
 
     def __getitem__(self, name: str) -> Statement:
         for statement in self.statements:
@@ -222,8 +224,8 @@ class Certificate:
     def digest(self) -> str:
         """SHA-256 over weights, configuration, level, record and statements together.
 
-        It shows that a file is as it was written. It is no signature: whoever changes the file can compute it again. What
-        protects against that is that everything else is computed again, too.
+        It shows that a file is as it was written. It is no signature: whoever changes the file can compute it again,
+        against which only computing everything else again protects.
         """
         return configuration_digest(self._body())
 
@@ -239,11 +241,7 @@ class Certificate:
 
     @classmethod
     def from_dict(cls, body: Any) -> Certificate:
-        """Reads what :meth:`to_dict` gives, and nothing else.
-
-        Raises:
-            CertificationError: if something is missing, superfluous, of another type or of another version.
-        """
+        """Reads what :meth:`to_dict` gives; another key, type, value or version raises ``CertificationError``."""
         if type(body) is not dict or type(body.get("schema")) is not int or body["schema"] != SCHEMA:
             found = body.get("schema") if type(body) is dict else type(body).__name__
             raise CertificationError(f"expected schema {SCHEMA}, received {str(found)[:40]!r}; issue the certificate again")
@@ -255,7 +253,7 @@ class Certificate:
                 raise CertificationError(f"expected {name} to be 64 hexadecimal digits, received {str(body[name])[:40]!r}")
         level = finite("level", body["level"])
         record = None if body["record"] is None else Record.from_dict(body["record"])
-        measured = () if record is None else LAYERS[1:]
+        measured = () if record is None else ("statistical", "paper")
         layers = {}
         for name, part in keys("layers", body["layers"], ("deterministic", *measured)).items():
             part = keys("a layer", part, ("name", "statements", "verdict"))
@@ -272,31 +270,14 @@ class Certificate:
         return cls(body["agent"], body["weights"], body["configuration"], level, layers, record, SCHEMA, body["digest"])
 
     def save(self, path: str | Path) -> Path:
-        """Write as JSON.
-
-        Args:
-            path: file.
-
-        Returns:
-            The file.
-        """
+        """Writes it as JSON; returns the path."""
         path = Path(path)
         path.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
         return path
 
     @classmethod
     def load(cls, path: str | Path) -> Certificate:
-        """Read a certificate that :meth:`save` has written.
-
-        Args:
-            path: file.
-
-        Returns:
-            The certificate.
-
-        Raises:
-            CertificationError: if it cannot be read; every other key, type or value than :meth:`save` writes is refused.
-        """
+        """Reads what :meth:`save` has written; any other key, type or value raises ``CertificationError``."""
         try:
             with Path(path).open("rb") as file:
                 data = file.read(_BYTES + 1)
@@ -333,15 +314,7 @@ def _no_repetition(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def weights_digest(state: Mapping[str, Tensor]) -> str:
-    """SHA-256 of names, types, shapes and bytes of weights, independent of their order.
-
-    Args:
-        state: state dict.
-
-    Returns:
-        64 hexadecimal digits.
-
-    Source: none.
+    """SHA-256 of names, types, shapes and bytes of a state dict, independent of their order, in hexadecimal digits.
 
     Example:
         >>> weights_digest({"a": torch.zeros(2)}) == weights_digest({"a": torch.zeros(2).double()})
@@ -356,15 +329,7 @@ def weights_digest(state: Mapping[str, Tensor]) -> str:
 
 
 def configuration_digest(configuration: Any) -> str:
-    """SHA-256 of plain values, independent of the order of keys.
-
-    Args:
-        configuration: what ``json`` can write.
-
-    Returns:
-        64 hexadecimal digits.
-
-    Source: none.
+    """SHA-256 of what ``json`` can write, independent of the order of keys, in hexadecimal digits.
 
     Example:
         >>> configuration_digest({"a": 1, "b": 2}) == configuration_digest({"b": 2, "a": 1})
@@ -380,25 +345,19 @@ def differences(
     confirm: Callable[[str, float], bool | None] | None = None,
     repeat: Callable[[int], Layer] | None = None,
 ) -> dict[Reason, str]:
-    """What a certificate claims about its weights that a recomputation does not give.
+    """What a certificate claims about its weights that a recomputation does not give, by reason; empty if all agrees.
 
-    A claim may be weaker than what was found, never stronger; all else has to be the same. Statements of measured layers are
-    generated from the record again, and have to be the same in every word.
+    A claim may be weaker than what was found, never stronger; all else has to be the same. Statements of measured
+    layers are generated from the record again, and have to be the same in every word. ``UNDECIDED`` alone: nothing was
+    found wrong, but not everything was found again in the time.
 
     Args:
         claimed: as it was read.
-        recomputed: weights, configuration and deterministic layer, from the agent; the record of the claimed one, and the
-            layers that are generated from it.
+        recomputed: weights, configuration and deterministic layer from the agent, the rest from the claimed record.
         confirm: whether a tolerated error, by the name of its statement, is proved although the recomputed bound is
             smaller; None: not in time.
-        repeat: the deterministic layer, computed with at most a number of boxes: whoever claims to have given up after so
-            many has to have.
-
-    Returns:
-        Reasons with what was found; empty if all agrees. ``UNDECIDED`` alone: nothing was found wrong, but not everything
-        was found again in the time.
-
-    Source: none.
+        repeat: the deterministic layer, computed with at most a number of boxes: whoever claims to have given up after
+            so many has to have.
 
     Example:
         >>> one = Certificate("a", "0", "0", 0.0, {})

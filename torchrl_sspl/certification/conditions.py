@@ -1,7 +1,7 @@
 r"""The conditions of a barrier certificate, decided for frozen networks on the whole latent domain.
 
-All statements are about the closed loop of latent dynamics and policy, :math:`z^+ = d(z, \pi(z))`, on a box that the
-encoder cannot leave. Each is proved, refuted with a counterexample, or undecided with what remains.
+All are about the closed loop :math:`z^+ = d(z, \pi(z))` on a box that the encoder cannot leave. Each is proved, refuted
+with a counterexample, or undecided with what remains.
 """
 
 from __future__ import annotations
@@ -22,19 +22,18 @@ from torchrl_sspl.lipschitz import lipschitz_upper
 from torchrl_sspl.lipschitz.layers import FORMS, Activation, clamp
 from torchrl_sspl.lipschitz.network import check_module, flat_layers
 
-CONDITIONS = ("R3", "R1", "R2")
 _SCALES = (1e-10, 1e10)
 
 
 @dataclass(frozen=True)
 class ClosedLoop:
-    """Frozen networks in the form in which bounds propagate through them.
+    r"""Frozen networks in the form in which bounds propagate through them; made by :func:`closed_loop`.
 
     Attributes:
         barrier: B, ``(n, p) -> (n, 1)``.
-        step: :math:`d(z, \\pi(z))`, ``(n, p) -> (n, p)``.
-        looped: :math:`B(d(z, \\pi(z)))`, ``(n, p) -> (n, 1)``.
-        inner: number of the step of ``looped`` that holds :math:`d(z, \\pi(z))`.
+        step: :math:`d(z, \pi(z))`, ``(n, p) -> (n, p)``.
+        looped: :math:`B(d(z, \pi(z)))`, ``(n, p) -> (n, 1)``.
+        inner: number of the step of ``looped`` that holds :math:`d(z, \pi(z))`.
         lipschitz_bound: proved Lipschitz constant of B.
         low: lower corner of the domain, ``(p,)`` float64.
         high: upper corner, ``(p,)`` float64.
@@ -54,33 +53,15 @@ class ClosedLoop:
         return self.barrier.input_dim
 
     def problem(
-        self, *, level: float | None, weight: Sequence[float] = (0.0,), constant: Sequence[float] = (0.0,)
+        self, *, level: float | None, weight: tuple[float, ...] = (0.0,), constant: tuple[float, ...] = (0.0,)
     ) -> Problem:
-        """Maximum of :math:`\\min_k B(d(z, \\pi(z))) - b_k B(z) + c_k` where B is at most a level.
-
-        Args:
-            level: of B; None for no constraint.
-            weight: :math:`b_k`, nonnegative.
-            constant: :math:`c_k`.
-
-        Returns:
-            The problem.
-        """
+        r"""Maximum of :math:`\min_k B(d(z, \pi(z))) - b_k B(z) + c_k` where B is at most a level, if one is given."""
+        b, c = (torch.tensor(v, dtype=torch.float64) for v in (weight, constant))
         rows = torch.ones(len(weight), 1, dtype=torch.float64)
         # An infinite constant would turn the cheap tests into comparisons with infinity and NaN.
         known = self.lipschitz_bound if math.isfinite(self.lipschitz_bound) else None
-        return Problem(
-            self.low,
-            self.high,
-            self.looped,
-            rows,
-            self.barrier,
-            torch.tensor(list(weight), dtype=torch.float64),
-            torch.tensor(list(constant), dtype=torch.float64),
-            level=level,
-            lipschitz=known,
-            inner=self.inner,
-        )
+        domain = self.low, self.high
+        return Problem(*domain, self.looped, rows, self.barrier, b, c, level=level, lipschitz=known, inner=self.inner)
 
 
 def closed_loop(
@@ -98,27 +79,22 @@ def closed_loop(
     .. math:: u = s \operatorname{clamp}(\operatorname{net}_\pi(z), -1, 1), \qquad
         z^+ = \operatorname{clamp}(z + \operatorname{net}_d(z, u / s), -1, 1)
 
-    Modules are known by their exact types (:mod:`torchrl_sspl.lipschitz.layers`), and whatever might stand between their
-    weights and what they compute is refused.
+    Modules are known by their exact types (:mod:`torchrl_sspl.lipschitz.layers`), and whatever might stand between
+    their weights and what they compute is refused.
 
     Args:
-        barrier: ``nn.Sequential`` of linear layers and activations (or a barrier of the library with ``collapse()``),
-            p inputs, 1 output.
-        dynamics: module in the form above (``modules.LatentDynamics``); or a plain ``nn.Sequential`` of ``(z, u)``,
+        barrier: ``nn.Sequential`` of linear layers and activations (or one with ``collapse()``), p inputs, 1 output.
+        dynamics: module in the form above (``modules.LatentDynamics``), or a plain ``nn.Sequential`` of ``(z, u)``,
             p + m inputs and p outputs, taken as it is. Either takes the action in physical units.
-        policy: module in the form above (``modules.Policy``); or a plain ``nn.Sequential``, p inputs and m outputs. Either
-            gives the action in physical units.
+        policy: module in the form above (``modules.Policy``), or a plain ``nn.Sequential``, p inputs and m outputs.
+            Either gives the action in physical units.
         latent_dim: p.
         lipschitz_bound: proved Lipschitz constant of the barrier (``math.inf`` where none is known).
         low: lower corner of the domain, a number or ``(p,)``.
         high: upper corner.
 
-    Returns:
-        The closed loop.
-
     Raises:
-        StructureError: if a module is of neither form or may compute something else than it says, or the action scales
-            differ, are not positive or not finite.
+        StructureError: if a module may compute something else than it says, or an action scale differs or is not valid.
         ConfigError: if the domain is empty.
         ShapeError: if the networks do not fit each other.
         NonFiniteError: if a weight is NaN or infinite.
@@ -126,13 +102,10 @@ def closed_loop(
     Source: paper eq. (8)-(9), composed; deviation: none.
 
     Example:
-        >>> half = nn.Linear(2, 2, bias=False)  # z+ = z / 2
-        >>> _ = half.weight.data.copy_(0.5 * torch.eye(2))
-        >>> plant = nn.Sequential(nn.Linear(3, 2, bias=False))
-        >>> _ = plant[0].weight.data.copy_(torch.cat([0.5 * torch.eye(2), torch.zeros(2, 1)], 1))
-        >>> system = closed_loop(nn.Sequential(nn.Linear(2, 1)), plant, nn.Sequential(nn.Linear(2, 1)), latent_dim=2,
-        ...                      lipschitz_bound=math.inf)
-        >>> system.step(torch.ones(1, 2)).tolist()
+        >>> plant = nn.Sequential(nn.Linear(3, 2, bias=False))  # z+ = z / 2, whatever the action is
+        >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.5, 0.0]), plant.parameters())
+        >>> barrier, policy = nn.Sequential(nn.Linear(2, 1)), nn.Sequential(nn.Linear(2, 1))
+        >>> closed_loop(barrier, plant, policy, latent_dim=2, lipschitz_bound=math.inf).step(torch.ones(1, 2)).tolist()
         [[0.5, 0.5]]
     """
     corners = [torch.as_tensor(c, dtype=torch.float64).cpu().expand(latent_dim).clone() for c in (low, high)]
@@ -150,8 +123,8 @@ def closed_loop(
     looped.network(inner, barrier)
     if alone.output_dim != 1 or step.output_dim != latent_dim:
         raise ConfigError(
-            f"expected a barrier of one output and dynamics of {latent_dim}, received {alone.output_dim} and "
-            f"{step.output_dim}"
+            f"expected a barrier of one output and dynamics of {latent_dim}, received {alone.output_dim} "
+            f"and {step.output_dim}"
         )
     return ClosedLoop(alone, step, looped, inner, float(lipschitz_bound), *corners)
 
@@ -259,85 +232,67 @@ def decide_invariance(
     Source: paper eq. (5); deviation: on the set instead of everywhere, on the whole latent domain instead of samples.
 
     Example:
-        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2 + 0 u
-        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
-        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
-        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
-        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
-        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
-        >>> decide_invariance(system, margin=0.2).status, decide_invariance(system, margin=0.3).status
-        ('proved', 'refuted')
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
+        >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
+        >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> [decide_invariance(loop, level=0.5, margin=m).status for m in (0.2, 0.3)]
+        ['proved', 'refuted']
     """
-    if condition not in CONDITIONS:
-        raise ConfigError(f"expected condition to be one of {', '.join(CONDITIONS)}, received {condition!r}")
+    terms: dict[str, dict[str, tuple[float, ...]]] = {
+        "R3": dict(constant=(margin - level,)),
+        "R1": dict(weight=(1.0 - decay,), constant=(margin,)),
+        "R2": dict(weight=(1.0, 0.0), constant=(margin + decrement, margin + floor)),
+    }
+    if condition not in terms:
+        raise ConfigError(f"expected condition to be one of {', '.join(terms)}, received {condition!r}")
     if not 0.0 <= decay <= 1.0 or decrement < 0.0 or not math.isfinite(level + margin + floor):
         raise ConfigError(
             f"expected 0 <= decay <= 1, decrement >= 0 and finite level, margin and floor, received decay={decay}, "
             f"decrement={decrement}, level={level}, margin={margin}, floor={floor}"
         )
-    if condition == "R3":
-        problem = system.problem(level=level, constant=(margin - level,))
-    elif condition == "R1":
-        problem = system.problem(level=level, weight=(1.0 - decay,), constant=(margin,))
-    else:
-        problem = system.problem(level=level, weight=(1.0, 0.0), constant=(margin + decrement, margin + floor))
+    problem = system.problem(level=level, **terms[condition])
     return maximise(problem, threshold=0.0, budget=budget, confirm=confirm, progress=progress)
 
 
 @dataclass(frozen=True)
 class LargestError:
-    r"""How large a latent error the invariance tolerates.
+    """How large a latent error the invariance tolerates; errors in latent units."""
 
-    Attributes:
-        delta: proved: for errors up to this (latent units) the set is kept; negative: it is not kept even without any.
-        refuted_above: for errors above this a counterexample was found (of the Lipschitz argument, not of the system).
-        outcome: the search behind it.
-    """
-
-    delta: float
-    refuted_above: float
-    outcome: Outcome
+    delta: float  # proved: for errors up to this the set is kept; negative: it is not kept even without any
+    refuted_above: float  # above this there is a counterexample, of the Lipschitz argument, not of the system
+    outcome: Outcome  # the search behind it
 
 
 def largest_error(
     system: ClosedLoop, *, level: float = 0.0, tolerance: float = 1e-3, budget: Budget | None = None, progress: bool = False
 ) -> LargestError:
-    r"""Largest error of the latent dynamics for which :math:`\{B \le s\}` is kept.
+    r"""Largest error of the latent dynamics for which :math:`\{B \le s\}` is kept, from both sides.
 
     .. math:: \delta^* = - \frac{1}{L_B} \max_{B(z) \le s} \left( B(d(z, \pi(z))) - s \right)
 
     Args:
-        system: the closed loop.
+        system: the closed loop, with a finite Lipschitz bound.
         level: s, barrier units.
         tolerance: distance of the two sides of the maximum at which the search ends, barrier units.
         budget: when to give up.
         progress: show a progress bar.
 
-    Returns:
-        The error, from both sides.
-
-    Source: none (the paper estimates the error and asks for the margin; here the margin is computed and the error is
-    compared with it).
+    Source: none (the paper estimates the error and asks for the margin; here the margin is computed).
 
     Example:
-        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
-        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
-        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
-        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
-        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
-        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
-        >>> abs(largest_error(system).delta - 0.25) < 2e-3
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
+        >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
+        >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> abs(largest_error(loop, level=0.5).delta - 0.25) < 2e-3
         True
     """
     if not math.isfinite(system.lipschitz_bound):
         raise ConfigError("expected a finite Lipschitz bound of the barrier, received infinity; prove one first")
-    found = maximise(
-        system.problem(level=level, constant=(-level,)), tolerance=tolerance, budget=budget, progress=progress
-    )
+    problem = system.problem(level=level, constant=(-level,))
+    found = maximise(problem, tolerance=tolerance, budget=budget, progress=progress)
     # What decides, decides by more than the slack.
-    return LargestError(
-        _below(-(found.upper + SLACK) / system.lipschitz_bound), (SLACK - found.lower) / system.lipschitz_bound, found
-    )
+    proved = _below(-(found.upper + SLACK) / system.lipschitz_bound)
+    return LargestError(proved, (SLACK - found.lower) / system.lipschitz_bound, found)
 
 
 def _below(value: float) -> float:
@@ -347,18 +302,11 @@ def _below(value: float) -> float:
 
 @dataclass(frozen=True)
 class ComputedError:
-    r"""How large a latent error the numbers that are computed tolerate.
+    """How large a latent error the numbers that are computed tolerate."""
 
-    Attributes:
-        delta: proved: for errors up to this (latent units) the set of the computed barrier is kept by the computed step;
-            at most zero: not even without any.
-        barrier_rounding: what the computed barrier is off at most, anywhere, barrier units.
-        step_rounding: what the computed :math:`d(z, \pi(z))` is off at most, Euclidean norm, latent units.
-    """
-
-    delta: float
-    barrier_rounding: float
-    step_rounding: float
+    delta: float  # proved for the computed barrier and step, latent units; at most zero: not kept even without errors
+    barrier_rounding: float  # what the computed barrier is off at most, anywhere, barrier units
+    step_rounding: float  # the same of the computed d(z, pi(z)), Euclidean norm, latent units
 
 
 def computed_error(
@@ -377,32 +325,7 @@ def computed_error(
         - \epsilon_d
 
     with :math:`\epsilon_B \ge |\hat B - B|` and :math:`\epsilon_d \ge \|\hat d(z, \hat\pi(z)) - d(z, \pi(z))\|` on the
-    whole domain.
-
-    Args:
-        system: the closed loop.
-        known: what it tolerates in real arithmetic.
-        level: s, barrier units.
-        unit: unit roundoff of the dtype.
-        tolerance: distance of the two sides of the maximum at which the search ends, barrier units.
-        budget: when to give up.
-        boxes: number of boxes on which the rounding is bounded.
-
-    Returns:
-        The error and the roundings.
-
-    Source: none.
-
-    Example:
-        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
-        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
-        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
-        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
-        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
-        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
-        >>> known = largest_error(system)
-        >>> 0.0 < known.delta - computed_error(system, known).delta < 1e-3
-        True
+    whole domain, bounded on so many boxes for this unit roundoff; ``known`` is the error in real arithmetic.
     """
     lipschitz = system.lipschitz_bound
     of_barrier, of_step = (
@@ -413,48 +336,35 @@ def computed_error(
     lost = of_step + of_barrier / lipschitz
     delta = known.delta - lost  # what it could be at most
     if delta > 0.0:
-        found = maximise(
-            system.problem(level=level + of_barrier + SLACK, constant=(-level,)), tolerance=tolerance, budget=budget
-        )
+        problem = system.problem(level=level + of_barrier + SLACK, constant=(-level,))
+        found = maximise(problem, tolerance=tolerance, budget=budget)
         delta = -(found.upper + SLACK) / lipschitz - lost
     return ComputedError(_below(_below(delta)), of_barrier, of_step)
 
 
 def decide_domain(system: ClosedLoop, *, budget: Budget | None = None) -> Outcome:
-    r"""Decides whether :math:`d(z, \pi(z))` stays in the latent domain.
+    r"""Decides whether :math:`d(z, \pi(z))` stays in the latent domain; a clamp to the domain proves it at once.
 
     Args:
         system: the closed loop.
         budget: when to give up.
 
-    Returns:
-        The outcome; a clamp to the domain proves it at once.
-
     Source: none (the paper's latent space is unbounded).
 
     Example:
-        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
-        >>> _ = plant[0].weight.data.copy_(torch.tensor([[1.5, 0.0]]))
-        >>> system = closed_loop(nn.Sequential(nn.Linear(1, 1)), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1,
-        ...                      lipschitz_bound=math.inf)
-        >>> decide_domain(system).status
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = 3 z / 2
+        >>> nn.utils.vector_to_parameters(torch.tensor([1.5, 0.0]), plant.parameters())
+        >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> decide_domain(loop).status
         'refuted'
     """
     last = system.step.steps[-1]
     if isinstance(last, Apply) and _within(last.activation, system):
         return Outcome("proved", 0.0, -math.inf, None, 0, 0.0, 0.0, 0)
     p = system.latent_dim
-    eye = torch.eye(p, dtype=torch.float64)
-    problem = Problem(
-        system.low,
-        system.high,
-        system.step,
-        torch.cat([eye, -eye]),
-        system.barrier,
-        torch.zeros(2 * p, dtype=torch.float64),
-        torch.cat([-system.high, system.low]),
-        combine="max",
-    )
+    eye, low, high = torch.eye(p, dtype=torch.float64), system.low, system.high
+    rows, constant = torch.cat([eye, -eye]), torch.cat([-high, low])
+    problem = Problem(low, high, system.step, rows, system.barrier, torch.zeros_like(constant), constant, combine="max")
     return maximise(problem, threshold=0.0, budget=budget)
 
 
@@ -466,17 +376,11 @@ def _within(activation: Activation, system: ClosedLoop) -> bool:
 
 @dataclass(frozen=True)
 class Vacuity:
-    """Whether a statement about :math:`\\{B \\le s\\}` says anything.
+    r"""Whether a statement about :math:`\{B \le s\}` says anything; points are ``(p,)``."""
 
-    Attributes:
-        status: "neither" (both points exist), "empty" (proved), "everything" (proved) or "undecided".
-        inside: a point with B below s, ``(p,)``, or None.
-        outside: a point with B above s, ``(p,)``, or None.
-    """
-
-    status: str
-    inside: Tensor | None
-    outside: Tensor | None
+    status: str  # "neither" (both points exist), "empty" (proved), "everything" (proved) or "undecided"
+    inside: Tensor | None  # a point with B below s
+    outside: Tensor | None  # a point with B above s
 
 
 def decide_vacuity(system: ClosedLoop, *, level: float = 0.0, budget: Budget | None = None) -> Vacuity:
@@ -487,15 +391,12 @@ def decide_vacuity(system: ClosedLoop, *, level: float = 0.0, budget: Budget | N
         level: s, barrier units.
         budget: when to give up.
 
-    Returns:
-        The verdict with its witnesses.
-
     Source: none; a barrier that is negative everywhere meets the paper's third condition without saying anything.
 
     Example:
-        >>> system = closed_loop(nn.Sequential(nn.Linear(1, 1)), nn.Sequential(nn.Linear(2, 1)),
-        ...                      nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=math.inf)
-        >>> decide_vacuity(system, level=-100.0).status
+        >>> plant, policy = nn.Sequential(nn.Linear(2, 1)), nn.Sequential(nn.Linear(1, 1))
+        >>> loop = closed_loop(nn.Identity(), plant, policy, latent_dim=1, lipschitz_bound=1.0)
+        >>> decide_vacuity(loop, level=-2.0).status
         'empty'
     """
     zero = torch.zeros(1, dtype=torch.float64)
@@ -519,31 +420,25 @@ def decide_vacuity(system: ClosedLoop, *, level: float = 0.0, budget: Budget | N
 def search_level(
     system: ClosedLoop, *, levels: Sequence[float], margin: float = 0.0, budget: Budget | None = None
 ) -> tuple[float, Outcome] | None:
-    r"""The first of several levels for which :math:`\{B \le s\}` is kept (R3).
+    r"""The first of several levels for which :math:`\{B \le s\}` is kept (R3), with its outcome.
 
     Args:
         system: the closed loop.
-        levels: s in the order in which they are tried, all at most zero; usually descending.
+        levels: s in the order in which they are tried, all at most zero (else ``ConfigError``); usually descending.
         margin: m, barrier units.
         budget: when to give up on one level.
 
     Returns:
         Level and outcome, or None if none is proved; an empty set is none.
 
-    Raises:
-        ConfigError: if a level is positive.
-
     Source: none.
 
     Example:
-        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
-        >>> _ = plant[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
-        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
-        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
-        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
-        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
-        >>> search_level(system, levels=[0.0, -0.1], margin=0.2)[0]
-        0.0
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = 2 z, and B(z) = z
+        >>> nn.utils.vector_to_parameters(torch.tensor([2.0, 0.0]), plant.parameters())
+        >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> search_level(loop, levels=[0.0, -0.1], margin=0.05)[0]
+        -0.1
     """
     if any(level > 0 for level in levels):
         raise ConfigError(f"expected levels of at most zero, received {list(levels)}; above zero a set may touch U")
@@ -556,60 +451,32 @@ def search_level(
 
 
 def evaluation_rounding(system: ClosedLoop, *, unit: float = 2.0**-53, per_axis: int = 4) -> float:
-    r"""How far a floating-point evaluation of :math:`B(d(z, \pi(z)))` can be from its exact value, anywhere.
+    r"""How far an evaluation of :math:`B(d(z, \pi(z)))` with a unit roundoff can be from the exact one, barrier units.
 
-    With the unit of float64 it has to lie far below the slack by which bounds decide. With that of float32 it is a worst
-    case that real evaluations come nowhere near.
-
-    Args:
-        system: the closed loop.
-        unit: unit roundoff, :math:`2^{-53}` for float64, :math:`2^{-24}` for float32.
-        per_axis: the domain is bounded in this many pieces per dimension.
-
-    Returns:
-        The largest bound over the domain, barrier units.
-
-    Source: Higham 2002, section 3.1.
-
-    Example:
-        >>> system = closed_loop(nn.Sequential(nn.Linear(1, 1)), nn.Sequential(nn.Linear(2, 1)),
-        ...                      nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=math.inf)
-        >>> 0.0 < evaluation_rounding(system) < 1e-12
-        True
+    With the unit of float64 it has to lie far below the slack by which bounds decide. With that of float32 it is a
+    worst case that real evaluations come nowhere near. The domain is bounded in ``per_axis`` pieces per dimension.
     """
     corners = zip(system.low, system.high, strict=True)
     edges = [torch.linspace(float(a), float(b), per_axis + 1, dtype=torch.float64) for a, b in corners]
-    low = torch.cartesian_prod(*[e[:-1] for e in edges]).reshape(-1, system.latent_dim)
-    high = torch.cartesian_prod(*[e[1:] for e in edges]).reshape(-1, system.latent_dim)
-    parts = zip(low.split(512), high.split(512), strict=True)
+    ends = ([e[:-1] for e in edges], [e[1:] for e in edges])
+    parts = zip(*(torch.cartesian_prod(*e).reshape(-1, system.latent_dim).split(512) for e in ends), strict=True)
     return max(float(rounding_bound(system.looped, a, b, unit)[-1].max()) for a, b in parts)
 
 
 def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
-    r"""Certified Lipschitz constant of :math:`z \mapsto d(z, \pi(z))`.
+    r"""Certified Lipschitz constant of :math:`z \mapsto d(z, \pi(z))`, the one that paper Theorem 1 leaves out.
 
     .. math:: L_{cl} \le 1 + L_{net_d} \sqrt{1 + L_{net_\pi}^2}
 
-    Args:
-        dynamics: module of the form "residual" (``modules.LatentDynamics``).
-        policy: module of the form "bounded" (``modules.Policy``), with the same action scale.
-
-    Returns:
-        The bound; clamps are 1-Lipschitz.
-
-    Raises:
-        StructureError: if a module is of another form, or the action scales differ.
-
-    Source: none; the constant that paper Theorem 1 leaves out.
+    Dynamics and policy are of the forms "residual" and "bounded" with one action scale, else ``StructureError``.
 
     Example:
         >>> from torchrl_sspl.modules import LatentDynamics, Policy
         >>> closed_loop_lipschitz(LatentDynamics(2, 1), Policy(2, 1)) > 1
         True
     """
-    (moved, scale), (control, own) = (
-        _taken_apart(m, n, f) for m, n, f in ((dynamics, "dynamics", "residual"), (policy, "policy", "bounded"))
-    )
+    moved, scale = _taken_apart(dynamics, "dynamics", "residual")
+    control, own = _taken_apart(policy, "policy", "bounded")
     if scale is None or own is None or not torch.equal(scale, own):
         raise StructureError("expected modules.LatentDynamics and modules.Policy of one action scale, received others")
     loop, gain = (float(lipschitz_upper(nn.Sequential(*layers))) for layers in (moved, control))
@@ -643,13 +510,10 @@ def find_counterexamples(
     Source: none (counterexample-guided training).
 
     Example:
-        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))
-        >>> _ = plant[0].weight.data.copy_(torch.tensor([[1.5, 0.0]]))  # z+ = 1.5 z
-        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
-        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
-        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
-        >>> system = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
-        >>> bool((find_counterexamples(system, 10).abs() > 0.33).all())
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = 3 z / 2, and B(z) = z
+        >>> nn.utils.vector_to_parameters(torch.tensor([1.5, 0.0]), plant.parameters())
+        >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> bool((find_counterexamples(loop, 10, level=0.5) > 0.33).all())
         True
     """
     problem = system.problem(level=level, constant=(margin - level,))

@@ -1,8 +1,8 @@
 """Whether the modules that are deployed compute what is proved: values at many points, against the graph.
 
-That the modules have the structure of the graph is checked when it is built (exact types, no hooks, nothing overridden, see
-:func:`~torchrl_sspl.lipschitz.network.check_module`). Here their values are compared with it, in the dtype and on the device
-on which they are deployed; the two may differ by what rounding can do at that point, and by nothing else.
+That they have the structure of the graph is checked when it is built
+(:func:`~torchrl_sspl.lipschitz.network.check_module`). Here their values are compared with it, in the dtype and on the
+device on which they are deployed; the two may differ by what rounding can do at that point, and by nothing else.
 """
 
 from __future__ import annotations
@@ -21,18 +21,7 @@ _CORNERS = 256
 
 
 def deployed_dtype(*modules: nn.Module) -> torch.dtype:
-    """The one dtype of all weights.
-
-    Args:
-        modules: the networks.
-
-    Returns:
-        float32 or float64.
-
-    Raises:
-        StructureError: if there are several, or another one.
-
-    Source: none.
+    """The one dtype of all weights, float32 or float64, else ``StructureError``.
 
     Example:
         >>> deployed_dtype(nn.Linear(1, 1), nn.Linear(1, 1))
@@ -49,25 +38,11 @@ def deployed_dtype(*modules: nn.Module) -> torch.dtype:
 def check_deployed(
     system: ClosedLoop, barrier: nn.Module, dynamics: nn.Module, policy: nn.Module, *, n: int = POINTS, seed: int = 0
 ) -> int:
-    """Compares the modules with the closed loop that was built from them.
+    """Compares the modules with the closed loop that was built from them, at random points, corners and the centre.
 
-    Args:
-        system: the closed loop.
-        barrier: as for :func:`~torchrl_sspl.certification.conditions.closed_loop`, but plain: what ``collapse()`` gives is
-            another module.
-        dynamics: see there.
-        policy: see there.
-        n: number of random points; corners of the domain and its centre come besides.
-        seed: of the random points.
-
-    Returns:
-        Number of points.
-
-    Raises:
-        StructureError: if the values differ by more than rounding allows, the modules change their input, or the dtypes are
-            not one of float32 and float64.
-
-    Source: none.
+    The modules are those of :func:`~.conditions.closed_loop`, with the ``collapse()`` of a barrier that has one.
+    Returns the number of all points; ``StructureError`` if values differ by more than rounding allows, a module changes
+    its input, or the dtypes are not one of float32 and float64.
 
     Example:
         >>> from torchrl_sspl.certification import closed_loop

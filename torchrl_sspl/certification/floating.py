@@ -1,9 +1,9 @@
 r"""How far a floating-point evaluation of a graph is from its exact value, at any point of a box.
 
-Every step k of an evaluation makes an error of its own, :math:`|\eta_k| \le \gamma_m (|W_k| |\hat x_k| + |b_k|)`, and hands
-on those of the steps before. The errors at one step change the output by no more than the largest slope of what follows
-takes them to, and the slopes of a ReLU network on a small box are nearly known: that is far less than the product of the
-absolute weights, which forgets that most units are off and that the others cancel.
+Every step k makes an error of its own, :math:`|\eta_k| \le \gamma_m (|W_k| |\hat x_k| + |b_k|)`, and hands on those of
+the steps before. The errors at one step change the output by no more than the largest slope of what follows takes them
+to, and the slopes of a ReLU network on a small box are nearly known: far less than the product of the absolute weights,
+which forgets that most units are off and that the others cancel.
 """
 
 from __future__ import annotations
@@ -25,39 +25,22 @@ _SAFETY = 1.0 + 1e-6  # for the float64 arithmetic in which the bounds are compu
 def rounding_bound(
     graph: Graph, low: Tensor, high: Tensor, unit: float = 2.0**-24, *, refined: bool = False
 ) -> list[Tensor]:
-    r"""How far a floating-point evaluation of each step can be from its exact value, for every point of the boxes.
+    r"""Bounds ``(n, size)`` of how far an evaluation of each step can be from its exact value, anywhere on boxes.
 
     .. math::
         |\hat x_k - x_k| \le |W_k| e_{k-1} + \eta_k, \quad
         \eta_k = \gamma_m \left( |W_k| (|x_{k-1}| + e_{k-1}) + |b_k| \right), \quad \gamma_m = \frac{m u}{1 - m u}
 
-    with m the number of terms of the longest sum and the roundings of the step besides. Products may be summed in any order
-    and with fused multiplication, so that no batch size, thread or library makes a difference. Activations hand an error on by
-    their steepest slope on what the interval and the error allow.
+    with m the number of terms of the longest sum and the roundings of the step besides, and u the unit roundoff, 2^-24
+    for IEEE float32 (no TF32), 2^-53 for float64. Products may be summed in any order and with fused multiplication, so
+    that no batch size, thread or library makes a difference. Activations hand an error on by their steepest slope on
+    what the interval and the error allow.
 
-    Refined, the errors of the interfaces and of the last step are :math:`\sum_k |J_k| \eta_k`, with :math:`J_k` the slopes
-    of everything between, enclosed on the box and on whatever the errors themselves can reach.
-
-    Args:
-        graph: the function, with exact weights.
-        low: lower corners, ``(n, p)`` float64; small boxes give tight bounds.
-        high: upper corners, ``(n, p)`` float64.
-        unit: unit roundoff u: 2^-24 for IEEE float32 (no TF32), 2^-53 for float64.
-        refined: whether slopes are multiplied before their absolute values are taken.
-
-    Returns:
-        For each step ``(n, size)``, bounds of the error.
-
-    Raises:
-        ShapeError: if the corners do not fit the graph.
+    Refined, the errors of the interfaces and of the last step are :math:`\sum_k |J_k| \eta_k`, with :math:`J_k` the
+    slopes of everything between, enclosed on the box and on whatever the errors themselves can reach. The corners are
+    ``(n, p)`` float64; small boxes give tight bounds.
 
     Source: Higham 2002, section 3.1; the refinement is Lady Windermere's fan (Hairer, Norsett, Wanner 1993).
-
-    Example:
-        >>> graph = Graph(1)
-        >>> _ = graph.linear([0], [torch.tensor([[2.0]])])
-        >>> 0.0 < rounding_bound(graph, -torch.ones(1, 1).double(), torch.ones(1, 1).double())[-1].item() < 2e-6
-        True
     """
     box = Enclosure(graph, low, high, tight=not refined)
     errors, local = [torch.zeros_like(low)], [torch.zeros_like(low)]
@@ -91,22 +74,9 @@ def rounding_bound(
 
 
 def largest_rounding(graph: Graph, low: Tensor, high: Tensor, unit: float, *, boxes: int = 8192) -> float:
-    """How far the last step of a floating-point evaluation can be from its exact value, anywhere on a domain.
+    """Bound of the Euclidean norm of the last step's rounding error anywhere on a domain; infinity where there is none.
 
-    Args:
-        graph: the function.
-        low: lower corner of the domain, ``(p,)`` float64.
-        high: upper corner.
-        unit: unit roundoff.
-        boxes: about how many boxes are bounded; those with the largest bounds are cut first.
-
-    Returns:
-        Bound of the Euclidean norm of the error; infinity where there is none.
-
-    Raises:
-        ShapeError: if the corners do not fit the graph.
-
-    Source: none (branch and bound).
+    The domain from ``low`` to ``high``, ``(p,)`` float64, is cut into about so many boxes, the worst ones first.
 
     Example:
         >>> graph = Graph(2)

@@ -18,29 +18,17 @@ from torchrl_sspl.lipschitz.network import flat_layers
 
 @dataclass(frozen=True)
 class Affine:
-    r"""Step :math:`\sum_k W_k x_k + b`.
+    r"""Step :math:`\sum_k W_k x_k + b`, float64."""
 
-    Attributes:
-        sources: numbers of the steps whose outputs :math:`x_k` are taken.
-        weights: :math:`W_k`, each ``(out, in_k)``, float64.
-        bias: ``(out,)``, float64.
-        roundings: of the deployed evaluation, beside those of the products and the sums.
-    """
-
-    sources: tuple[int, ...]
-    weights: tuple[Tensor, ...]
-    bias: Tensor
-    roundings: int = 0
+    sources: tuple[int, ...]  # numbers of the steps whose outputs x_k are taken
+    weights: tuple[Tensor, ...]  # W_k, each (out, in_k)
+    bias: Tensor  # (out,)
+    roundings: int = 0  # of the deployed evaluation, beside those of the products and the sums
 
 
 @dataclass(frozen=True)
 class Apply:
-    """Step that applies an activation to every entry.
-
-    Attributes:
-        source: number of the step whose output is taken.
-        activation: the function.
-    """
+    """Step that applies an activation to every entry."""
 
     source: int
     activation: Activation
@@ -50,13 +38,7 @@ class Apply:
 class Graph:
     """Function of a vector, as steps; step 0 is the input, the last step is the output.
 
-    Weights are taken in float64; float32 weights are represented exactly.
-
-    Args:
-        input_dim: size of the input.
-        dtype: dtype of the bounds, float64 unless there is a reason.
-
-    Source: none.
+    Weights are taken in float64, which float32 weights fit in exactly. Methods that append a step return its number.
 
     Example:
         >>> graph = Graph(2)
@@ -67,12 +49,11 @@ class Graph:
     """
 
     input_dim: int
-    dtype: torch.dtype = torch.float64
     steps: list[Affine | Apply | None] = field(default_factory=lambda: [None])
     sizes: list[int] = field(default_factory=list)
     activated: set[int] = field(default_factory=set)  # steps to which an activation is applied
     interfaces: set[int] = field(default_factory=set)  # steps of few numbers, at which bounds are made tight
-    last_use: dict[int, list[int]] = field(default_factory=dict)  # step -> the steps that are needed for it for the last time
+    last_use: dict[int, list[int]] = field(default_factory=dict)  # step -> steps that are needed for it last
 
     def __post_init__(self) -> None:
         self.sizes = [self.input_dim]
@@ -85,24 +66,13 @@ class Graph:
     def linear(
         self, sources: Sequence[int], weights: Sequence[Tensor], bias: Tensor | None = None, *, roundings: int = 0
     ) -> int:
-        """Appends a sum of linear maps.
+        """Appends a sum of linear maps ``(out, in)`` of earlier steps, and a bias ``(out,)`` or none.
 
-        Args:
-            sources: numbers of the steps that are taken.
-            weights: one ``(out, in)`` matrix for each.
-            bias: ``(out,)``; zero if not given.
-            roundings: of the deployed evaluation, beside those of the products and the sums.
-
-        Returns:
-            Number of the new step.
-
-        Raises:
-            ShapeError: if the shapes do not fit.
-            NonFiniteError: if a weight is NaN or infinite.
+        The roundings are those of the deployed evaluation, beside those of the products and the sums.
         """
-        matrices = tuple(w.detach().to(self.dtype).cpu() for w in weights)
+        matrices = tuple(w.detach().double().cpu() for w in weights)
         out = matrices[0].shape[0]
-        offset = torch.zeros(out, dtype=self.dtype) if bias is None else bias.detach().to(self.dtype).cpu()
+        offset = torch.zeros(out, dtype=torch.float64) if bias is None else bias.detach().double().cpu()
         for source, matrix in zip(sources, matrices, strict=True):
             if matrix.shape != (out, self.sizes[source]) or offset.shape != (out,):
                 raise ShapeError(
@@ -114,27 +84,12 @@ class Graph:
         return self._append(Affine(tuple(sources), matrices, offset, roundings), out, sources)
 
     def apply(self, source: int, activation: Activation) -> int:
-        """Appends an activation.
-
-        Args:
-            source: number of the step that is taken.
-            activation: the function.
-
-        Returns:
-            Number of the new step.
-        """
+        """Appends an activation of an earlier step."""
         self.activated.add(source)
         return self._append(Apply(source, activation), self.sizes[source], [source])
 
     def interface(self, step: int) -> int:
-        """Marks a step of few numbers, at which bound propagation makes its bounds tight.
-
-        Args:
-            step: its number.
-
-        Returns:
-            The same number.
-        """
+        """Marks a step of few numbers, at which bound propagation makes its bounds tight; returns its number."""
         self.interfaces.add(step)
         return step
 
@@ -159,25 +114,11 @@ class Graph:
         return number
 
     def network(self, source: int, network: nn.Module) -> int:
-        """Appends the layers of a plain network.
-
-        Args:
-            source: number of the step that is taken.
-            network: ``nn.Sequential`` (possibly nested) of linear layers and activations, or a barrier of the library
-                whose ``collapse()`` gives one.
-
-        Returns:
-            Number of the last new step.
-
-        Raises:
-            StructureError: if a layer is of another kind, or may compute something else than it says.
-            ShapeError: if the layers do not fit each other.
-            NonFiniteError: if a weight is NaN or infinite.
-        """
+        """Appends the layers of a plain network (:func:`~torchrl_sspl.lipschitz.network.flat_layers`) after a step."""
         return self.layers(source, flat_layers(network))
 
     def layers(self, source: int, layers: Sequence[nn.Module]) -> int:
-        """Appends layers that were looked at (:func:`~torchrl_sspl.lipschitz.network.flat_layers`), as :meth:`network`."""
+        """Appends layers that were looked at, as :meth:`network`."""
         for layer in layers:
             if isinstance(layer, nn.Linear):
                 source = self.linear([source], [layer.weight], layer.bias)
@@ -186,20 +127,10 @@ class Graph:
         return source
 
     def values(self, point: Tensor) -> list[Tensor]:
-        """Outputs of all steps at points.
-
-        Args:
-            point: ``(n, input_dim)``.
-
-        Returns:
-            One ``(n, size)`` per step.
-
-        Raises:
-            ShapeError: if the shape is another one.
-        """
+        """Outputs of all steps at points ``(n, input_dim)``, each ``(n, size)``."""
         if point.ndim != 2 or point.shape[1] != self.input_dim:
             raise ShapeError(f"expected points of shape (n, {self.input_dim}), received {tuple(point.shape)}")
-        values = [point.to(self.dtype)]
+        values = [point.double()]
         for step in self.steps[1:]:
             if isinstance(step, Apply):
                 values.append(step.activation.value(values[step.source]))

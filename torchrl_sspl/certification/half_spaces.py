@@ -9,27 +9,17 @@ from torchrl_sspl.certification.propagation import LinearBound
 
 
 def programme(objective: LinearBound, constraint: LinearBound, radius: Tensor) -> Tensor:
-    r"""Largest value of a linear function on a box where another one is at most zero, by its dual.
+    r"""Largest value ``(n, K)`` of linear functions on boxes where another one is at most zero, by its dual.
 
     .. math:: \min_{\lambda \ge 0} \; h - \lambda k + \sum_i |g_i - \lambda q_i| r_i
 
-    The dual is convex and piecewise linear; its minimum lies at zero or at one of the :math:`g_i / q_i`. Every
-    :math:`\lambda \ge 0` gives a valid bound, whatever rounding does to it.
-
-    Args:
-        objective: :math:`g (z - c) + h`, ``n`` boxes and ``K`` rows.
-        constraint: :math:`q (z - c) + k` with the same centres, one row.
-        radius: of the boxes, ``(n, p)``.
-
-    Returns:
-        ``(n, K)``.
-
-    Source: none (duality of linear programmes).
+    The objective is :math:`g (z - c) + h` with K rows, the constraint :math:`q (z - c) + k` with one and the same
+    centres, the radius r is ``(n, p)``. The dual is convex and piecewise linear; its minimum lies at zero or at one of
+    the :math:`g_i / q_i`. Every :math:`\lambda \ge 0` gives a valid bound, whatever rounding does to it.
 
     Example:
         >>> one, zero = torch.ones(1, 1, 1), torch.zeros(1, 1)
-        >>> top = programme(LinearBound(one, zero, zero), LinearBound(one, zero - 0.25, zero), torch.ones(1, 1))
-        >>> top.item()  # z on [-1, 1] where z <= 0.25
+        >>> programme(LinearBound(one, zero, zero), LinearBound(one, zero - 0.25, zero), torch.ones(1, 1)).item()
         0.25
     """
     ratio = objective.slope / constraint.slope
@@ -41,17 +31,9 @@ def programme(objective: LinearBound, constraint: LinearBound, radius: Tensor) -
 
 
 def clip(low: Tensor, high: Tensor, constraint: LinearBound) -> tuple[Tensor, Tensor]:
-    r"""Smaller boxes that still hold every point at which a linear function is at most zero.
+    """Smaller boxes, corners ``(n, p)``, that still hold every point at which a linear function is at most zero.
 
-    Args:
-        low: lower corners, ``(n, p)``.
-        high: upper corners, ``(n, p)``.
-        constraint: :math:`q (z - c) + k`, one row; at most zero somewhere on each box.
-
-    Returns:
-        Lower and upper corners.
-
-    Source: none.
+    The function has one row, and is at most zero somewhere on each box.
 
     Example:
         >>> c = LinearBound(torch.ones(1, 1, 2), torch.ones(1, 1), torch.zeros(1, 2))  # z_0 + z_1 + 1 <= 0

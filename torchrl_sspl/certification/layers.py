@@ -1,4 +1,4 @@
-r"""The deterministic layer of a certificate: what the weights prove."""
+"""The deterministic layer of a certificate: what the weights prove."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget
-from torchrl_sspl.certification.certificate import PROVED, Layer, Reason, Statement
+from torchrl_sspl.certification.certificate import PROVED, Layer, Reason
 from torchrl_sspl.certification.conditions import (
     ClosedLoop,
     closed_loop,
@@ -43,7 +43,7 @@ def deterministic_layer(
     tolerance: float = 1e-3,
     budget: Budget | None = None,
 ) -> Layer:
-    r"""What follows from the weights alone, on the whole latent domain.
+    """What follows from the weights alone, on the whole latent domain; networks that are not certified raise nothing.
 
     Args:
         barrier: plain network, p inputs, 1 output.
@@ -59,19 +59,15 @@ def deterministic_layer(
         tolerance: accuracy of the tolerated error, barrier units.
         budget: of each search.
 
-    Returns:
-        The layer; nothing is raised for networks that are not certified.
-
     Source: paper Theorem 1 and Lemma 2; deviations: the set instead of everywhere, the whole domain instead of samples,
     a proof instead of the sign of a log-determinant.
 
     Example:
-        >>> step = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2
-        >>> _ = step[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
+        >>> step, policy = nn.Sequential(nn.Linear(2, 1, bias=False)), nn.Sequential(nn.Linear(1, 1))  # z+ = z / 2
+        >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), step.parameters())
         >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
-        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
-        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
-        >>> layer = deterministic_layer(barrier, step, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=2.0)
+        >>> nn.utils.vector_to_parameters(torch.tensor([1.0, -1.0, 0.0, 0.0, 1.0, 1.0, -0.5]), barrier.parameters())
+        >>> layer = deterministic_layer(barrier, step, policy, latent_dim=1, lipschitz_bound=2.0)
         >>> layer.holds, round(layer["tolerated error"].value, 2)
         (True, 0.12)
     """
@@ -99,9 +95,8 @@ class _Proof:
         self.layer = Layer("deterministic")
 
     def state(self, name: str, text: str, holds: bool, reason: Reason | None = None, **more: Any) -> bool:
-        """Adds a statement; the reason is why it does not hold, if it does not."""
-        code = "" if holds or reason is None else reason.name
-        self.layer.statements.append(Statement(name, text, PROVED, holds, reason=code, **more))
+        """Adds a statement, and returns whether it holds."""
+        self.layer.state(PROVED, name, text, holds, reason, **more)
         return holds
 
     def networks(self, barrier: nn.Module, dynamics: nn.Module, policy: nn.Module, of: dict[str, Any]) -> ClosedLoop | None:
@@ -204,30 +199,16 @@ def level_that_holds(
     levels: Sequence[float] = (0.0, -0.01, -0.02, -0.05, -0.1, -0.15, -0.2, -0.3),
     budget: Budget | None = None,
 ) -> float:
-    r"""The largest of several levels whose set is kept; the first of them if none is.
+    """The largest of several levels, barrier units, whose set is kept; the first of them if none is.
 
-    Args:
-        barrier: plain network.
-        dynamics: see :func:`~torchrl_sspl.certification.conditions.closed_loop`.
-        policy: see there.
-        latent_dim: p.
-        lipschitz_bound: proved Lipschitz constant of the barrier.
-        levels: in the order in which they are tried.
-        budget: of each.
-
-    Returns:
-        The level, barrier units.
-
-    Source: none.
+    The networks are those of :func:`~torchrl_sspl.certification.conditions.closed_loop`; the levels are tried in their
+    order, each with this budget.
 
     Example:
-        >>> step = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2
-        >>> _ = step[0].weight.data.copy_(torch.tensor([[0.5, 0.0]]))
-        >>> barrier = nn.Sequential(nn.Linear(1, 2), nn.ReLU(), nn.Linear(2, 1))  # |z| - 1/2
-        >>> _ = barrier.load_state_dict({"0.weight": torch.tensor([[1.0], [-1.0]]), "0.bias": torch.zeros(2),
-        ...                              "2.weight": torch.ones(1, 2), "2.bias": torch.tensor([-0.5])})
-        >>> level_that_holds(barrier, step, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=2.0)
-        0.0
+        >>> step, policy = nn.Sequential(nn.Linear(2, 1, bias=False)), nn.Sequential(nn.Linear(1, 1))  # z+ = 2 z
+        >>> nn.utils.vector_to_parameters(torch.tensor([2.0, 0.0]), step.parameters())
+        >>> level_that_holds(nn.Identity(), step, policy, latent_dim=1, lipschitz_bound=1.0, levels=(-0.1, -0.2))
+        -0.1
     """
     try:
         system = closed_loop(barrier, dynamics, policy, latent_dim=latent_dim, lipschitz_bound=lipschitz_bound)

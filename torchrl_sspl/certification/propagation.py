@@ -2,15 +2,15 @@ r"""Linear bound propagation through composed networks, for many boxes at once.
 
 On a box :math:`|z - c| \le r` every step x of a :class:`~torchrl_sspl.certification.graph.Graph` is enclosed
 
-- forward, :math:`|x - (G (z - c) + a)| \le e`, which costs p + 2 rows per box and gives the interval of every activation;
-- backward (CROWN), through the lines around the activations, which gives one linear function above (or below) a step
-  that holds on the whole box.
+- forward, :math:`|x - (G (z - c) + a)| \le e`, which costs p + 2 rows per box and gives the interval of every
+  activation;
+- backward (CROWN), through the lines around the activations: one linear function above (or below) it on the whole box.
 
-Forward bounds widen from layer to layer. At the interfaces of a graph (the action, the next latent: few numbers that
-everything passes through) they are replaced by backward bounds, and later backward passes end there; and where it is
-asked for, the intervals of all undecided activations are replaced too. Skip connections carry z itself as a linear map,
-so that nothing is lost on them. All arithmetic is float64; what it may round off is bounded by
-:func:`~torchrl_sspl.certification.floating.rounding_bound`, and a slack far above it is demanded wherever a bound decides.
+Forward bounds widen from layer to layer. At the interfaces of a graph (the action, the next latent) they are replaced
+by backward bounds, where later backward passes end; where it is asked for, the intervals of all undecided activations
+are replaced too. Skip connections carry z itself as a linear map, so that nothing is lost on them. What the float64
+arithmetic may round off is bounded by :func:`~.floating.rounding_bound`, and a slack far above it is demanded wherever
+a bound decides.
 """
 
 from __future__ import annotations
@@ -25,17 +25,11 @@ from torchrl_sspl.errors import ShapeError
 
 
 class LinearBound(NamedTuple):
-    r"""Linear functions :math:`g (z - c) + h` above (or below) something on boxes.
+    """Linear functions :math:`g (z - c) + h` above (or below) something on boxes."""
 
-    Attributes:
-        slope: g, ``(n, rows, p)``.
-        value: h, ``(n, rows)``.
-        center: c, ``(n, p)``.
-    """
-
-    slope: Tensor
-    value: Tensor
-    center: Tensor
+    slope: Tensor  # g, (n, rows, p)
+    value: Tensor  # h, (n, rows)
+    center: Tensor  # c, (n, p)
 
     def upper(self, radius: Tensor) -> Tensor:
         """Largest value within this radius ``(n, p)`` of the centre, ``(n, rows)``."""
@@ -68,18 +62,10 @@ class _Form(NamedTuple):
 
 
 class Enclosure:
-    r"""Bounds of the steps of a graph on boxes.
+    """Bounds of the steps of a graph on boxes with corners ``(n, p)`` float64, up to the step ``until`` (the last one).
 
-    Args:
-        graph: the function.
-        low: lower corners, ``(n, p)`` float64.
-        high: upper corners, ``(n, p)`` float64.
-        until: number of the last step that is bounded; the last of the graph if not given.
-        tight: replace the intervals of undecided activations by backward bounds; several times slower, much tighter on
-            large boxes and deep networks.
-
-    Raises:
-        ShapeError: if the corners do not fit the graph.
+    Tight, the intervals of undecided activations are replaced by backward bounds: several times slower, much tighter on
+    large boxes and deep networks.
 
     Source: Zhang et al. 2018 (CROWN) for the backward bounds.
 
@@ -87,16 +73,14 @@ class Enclosure:
         >>> graph = Graph(1)
         >>> a = graph.linear([0], [torch.tensor([[2.0]])])
         >>> _ = graph.linear([0, a], [torch.tensor([[-2.0]]), torch.eye(1)])  # 2 z - 2 z: exact
-        >>> box = Enclosure(graph, -torch.ones(1, 1).double(), torch.ones(1, 1).double())
-        >>> lower, upper = box.interval()
-        >>> lower.item(), upper.item()
-        (0.0, 0.0)
+        >>> [end.item() for end in Enclosure(graph, -torch.ones(1, 1).double(), torch.ones(1, 1).double()).interval()]
+        [0.0, 0.0]
     """
 
     def __init__(
         self, graph: Graph, low: Tensor, high: Tensor, *, until: int | None = None, tight: bool = False
     ) -> None:
-        check_boxes(graph, low, high)
+        _check_boxes(graph, low, high)
         self.graph, self.tight = graph, tight
         self.center, self.radius = 0.5 * (low + high), 0.5 * (high - low)
         n, p = low.shape
@@ -108,11 +92,7 @@ class Enclosure:
         self.extend(until)
 
     def extend(self, until: int | None = None) -> None:
-        """Bounds further steps.
-
-        Args:
-            until: number of the last one; the last of the graph if not given.
-        """
+        """Bounds further steps, up to this one or the last of the graph."""
         graph = self.graph
         last = len(graph.steps) - 1 if until is None else until
         for number in range(self._done + 1, last + 1):
@@ -138,25 +118,9 @@ class Enclosure:
             self._done = number
 
     def upper(self, rows: Tensor, step: int | None = None) -> LinearBound:
-        r"""Linear functions above :math:`C x`, by a backward pass.
+        """Linear functions above :math:`C x`, rows C ``(rows, size)`` and x a step (the last), by a backward pass.
 
-        Args:
-            rows: C, ``(rows, size)``; a bound below x is the negative of the bound above -x.
-            step: number of the step x; the last of the graph if not given.
-
-        Returns:
-            The functions.
-
-        Source: Zhang et al. 2018 (CROWN).
-
-        Example:
-            >>> graph = Graph(1)
-            >>> a = graph.linear([0], [torch.tensor([[1.0]])])
-            >>> _ = graph.network(a, torch.nn.ReLU())
-            >>> box = Enclosure(graph, -torch.ones(1, 1).double(), torch.ones(1, 1).double())
-            >>> bound = box.upper(torch.eye(1).double())
-            >>> bound.slope.item(), bound.value.item()
-            (0.5, 0.5)
+        A bound below x is the negative of the bound above -x. Source: Zhang et al. 2018 (CROWN).
         """
         graph, n = self.graph, len(self.center)
         last = len(graph.steps) - 1 if step is None else step
@@ -182,11 +146,8 @@ class Enclosure:
                 lines = part.activation.relax(*self._intervals[part.source])
                 above, below = c.clamp_min(0.0), c.clamp_max(0.0)
                 value += (above @ lines.upper_offset[..., None] + below @ lines.lower_offset[..., None])[..., 0]
-                _add(
-                    pending,
-                    part.source,
-                    above.mul_(lines.upper_slope[:, None]).addcmul_(below, lines.lower_slope[:, None]),
-                )
+                c = above.mul_(lines.upper_slope[:, None]).addcmul_(below, lines.lower_slope[:, None])
+                _add(pending, part.source, c)
         return LinearBound(slope, value, self.center)
 
     def interval(self, step: int | None = None) -> tuple[Tensor, Tensor]:
@@ -259,19 +220,8 @@ def _add(pending: dict[int, Tensor], key: int, value: Tensor) -> None:
     pending[key] = pending[key] + value if key in pending else value
 
 
-def check_boxes(graph: Graph, low: Tensor, high: Tensor) -> None:
-    """Refuses corners that do not fit a graph.
-
-    Args:
-        graph: the function.
-        low: lower corners.
-        high: upper corners.
-
-    Raises:
-        ShapeError: unless both are ``(n, p)`` float64.
-
-    Source: none.
-    """
+def _check_boxes(graph: Graph, low: Tensor, high: Tensor) -> None:
+    """Refuses corners that are not ``(n, p)`` float64 both."""
     if low.shape != high.shape or low.ndim != 2 or low.shape[1] != graph.input_dim or low.dtype != torch.float64:
         raise ShapeError(
             f"expected corners of shape (n, {graph.input_dim}) and dtype float64, received {tuple(low.shape)} "
@@ -280,20 +230,7 @@ def check_boxes(graph: Graph, low: Tensor, high: Tensor) -> None:
 
 
 def interval_bounds(graph: Graph, low: Tensor, high: Tensor) -> list[tuple[Tensor, Tensor]]:
-    """Interval of every step, by interval arithmetic.
-
-    Args:
-        graph: the function.
-        low: lower corners, ``(n, p)`` float64.
-        high: upper corners, ``(n, p)`` float64.
-
-    Returns:
-        Lower and upper ends ``(n, size)`` for each step.
-
-    Raises:
-        ShapeError: if the corners do not fit the graph.
-
-    Source: none (interval arithmetic).
+    """Lower and upper ends ``(n, size)`` of every step by interval arithmetic, to compare :class:`Enclosure` with.
 
     Example:
         >>> graph = Graph(1)
@@ -301,7 +238,7 @@ def interval_bounds(graph: Graph, low: Tensor, high: Tensor) -> list[tuple[Tenso
         >>> interval_bounds(graph, -torch.ones(1, 1).double(), torch.ones(1, 1).double())[-1][1].item()
         2.0
     """
-    check_boxes(graph, low, high)
+    _check_boxes(graph, low, high)
     bounds = [(low, high)]
     for step in graph.steps[1:]:
         if isinstance(step, Apply):

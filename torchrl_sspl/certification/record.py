@@ -1,4 +1,4 @@
-"""The record behind what a certificate measures: settings and counts, from which every measured statement is generated."""
+"""The record behind what a certificate measures: settings and counts, which every measured statement follows from."""
 
 from __future__ import annotations
 
@@ -10,41 +10,29 @@ from typing import Any
 from torchrl_sspl.errors import CertificationError, ConfigError
 from torchrl_sspl.seeds import spawn
 
-KINDS = ("states", "resets")
-SYSTEMS = ("described", "given")
-LARGEST = 10_000_000  # above which a number of episodes or steps is not believed
+_KINDS = ("states", "resets")
+_SYSTEMS = ("described", "given")
+_LARGEST = 10_000_000  # above which a number of episodes or steps is not believed
 #: Shares of the starts in the set and of the labels of U that may repeat others: float32 has few numbers on a line.
 REPEATED = 0.05
 
 
 def finite(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
-    """A number of a file, refused unless it is one, finite and in range.
-
-    Raises:
-        CertificationError: if it is not.
-    """
+    """A number of a file; ``CertificationError`` unless it is one, finite and in range."""
     if type(value) not in (int, float) or not math.isfinite(value) or not low <= value <= high:
         raise CertificationError(f"expected {name} to be a finite number in [{low}, {high}], received {str(value)[:40]!r}")
     return float(value)
 
 
 def count(name: str, value: Any, low: int = 0, high: int = 2**63) -> int:
-    """A whole number of a file, refused unless it is one and in range; true and 1.0 are none.
-
-    Raises:
-        CertificationError: if it is not.
-    """
+    """A whole number of a file; ``CertificationError`` unless it is one and in range; true and 1.0 are none."""
     if type(value) is not int or not low <= value <= high:
         raise CertificationError(f"expected {name} to be a whole number in [{low}, {high}], received {str(value)[:40]!r}")
     return value
 
 
 def keys(name: str, body: Any, expected: Any) -> Mapping[str, Any]:
-    """An object of a file, refused unless it has exactly the expected keys.
-
-    Raises:
-        CertificationError: if it has others.
-    """
+    """An object of a file; ``CertificationError`` unless it has exactly the expected keys."""
     if type(body) is not dict or set(body) != set(expected):
         found = sorted(body)[:20] if type(body) is dict else type(body).__name__
         raise CertificationError(f"expected {name} with the keys {sorted(expected)}, received {str(found)[:300]}")
@@ -85,7 +73,7 @@ class Counts:
 
     def __post_init__(self) -> None:
         for f in fields(self):
-            count(f.name, getattr(self, f.name), 0, LARGEST**2)
+            count(f.name, getattr(self, f.name), 0, _LARGEST**2)
         parts = (self.left, self.entered, self.aliased, self.undefined)
         if not max(parts) <= self.events <= min(sum(parts), self.episodes) or self.exceeding > self.episodes:
             raise CertificationError(f"expected counts of events that fit each other, received {self}")
@@ -114,9 +102,10 @@ class Record:
     """How fresh episodes were drawn, and what was counted.
 
     Attributes:
-        kind: "states" (starts and observations of U are drawn from a known state space) or "resets" (from the environment's
-            own resets).
-        system: "described" (the agent's description says how to build the system, and it is that one) or "given" (in code).
+        kind: "states" (starts and observations of U are drawn from a known state space) or "resets" (from the
+            environment's own resets).
+        system: "described" (the agent's description says how to build the system, and it is that one) or "given" (in
+            code).
         seed: root; block k draws from ``spawn(seed, "certificate", k)``.
         episodes: asked for.
         horizon: longest episode, in steps.
@@ -173,8 +162,8 @@ class Record:
     def complete(self) -> bool:
         """Whether the blocks are as many as the rule asks for, which looks at how many count, never at what happened.
 
-        With starts of a known state space: as many as were asked for, one if the set is empty. From resets: at least that
-        many, up to three times as many while fewer than asked for, but some, begin in the set or show U.
+        With starts of a known state space: as many as were asked for, one if the set is empty. From resets: at least
+        that many, up to three times as many while fewer than asked for, but some, begin in the set or show U.
         """
         drawn, blocks = len(self.blocks) * self.block, self.blocks
         if not blocks or self.kind == "states":
@@ -195,17 +184,13 @@ class Record:
 
     @classmethod
     def from_dict(cls, body: Any) -> Record:
-        """Reads what :meth:`to_dict` gives, and nothing else.
-
-        Raises:
-            CertificationError: if a key, a type or a value is not as it would write it.
-        """
+        """Reads what :meth:`to_dict` gives; ``CertificationError`` if a key, a type or a value is another one."""
         body = keys("a record", body, [f.name for f in fields(cls)])
-        for name, known in (("kind", KINDS), ("system", SYSTEMS)):
+        for name, known in (("kind", _KINDS), ("system", _SYSTEMS)):
             if body[name] not in known:
                 raise CertificationError(f"expected {name} to be one of {', '.join(known)}, received {str(body[name])[:40]!r}")
         for name, low in (("seed", 0), ("episodes", 1), ("horizon", 1), ("envs", 1)):
-            count(name, body[name], low, LARGEST if name != "seed" else 2**64)
+            count(name, body[name], low, _LARGEST if name != "seed" else 2**64)
         for name in ("confidence", "acceptable"):
             if not 0.0 < finite(name, body[name], 0.0, 1.0) < 1.0:
                 raise CertificationError(f"expected {name} in (0, 1), received {body[name]}")
@@ -215,7 +200,7 @@ class Record:
         used = body["used"] if body["used"] is None else [count("a used seed", s, -(2**63), 2**64) for s in body["used"]]
         names = [f.name for f in fields(Counts)]
         blocks = [Counts(**keys("a block", b, names)) for b in body["blocks"]]
-        sizes = {k: count(k, v, 0, LARGEST * 100) for k, v in keys("sizes", body["sizes"], SIZES).items()}
+        sizes = {k: count(k, v, 0, _LARGEST * 100) for k, v in keys("sizes", body["sizes"], SIZES).items()}
         numbers = {k: v if v is None else finite(k, v) for k, v in keys("numbers", body["numbers"], NUMBERS).items()}
         rims: list[tuple[str, int, float]] = []
         for row in body["rims"]:
@@ -228,11 +213,7 @@ class Record:
         return record
 
     def check(self) -> None:
-        """Raise unless the numbers fit each other.
-
-        Raises:
-            CertificationError: if they do not.
-        """
+        """``CertificationError`` unless the numbers fit each other."""
         for index, block in enumerate(self.blocks):
             n = self.size(index)
             if block.episodes > n or block.shown > 2 * n or block.steps > block.episodes * self.horizon:

@@ -4,32 +4,17 @@ from __future__ import annotations
 
 import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
-from typing import Protocol
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from torchrl_sspl.certification.certificate import Statement
 
 #: Statements whose value is a bound from below; every other value bounds something from above.
 LOWER_BOUNDS = ("tolerated error", "float32", "float64")
 
 
-class Shown(Protocol):
-    """What is needed of a statement to print its number."""
-
-    name: str
-    value: float | None
-    unit: str
-    misses_by: float | None
-
-
 def up(value: float, digits: int = 4) -> str:
-    """The number with so many digits, rounded up: for bounds from above.
-
-    Args:
-        value: the number.
-        digits: significant ones.
-
-    Returns:
-        The text; never less than the number.
-
-    Source: none.
+    """The number with so many significant digits, rounded up: never less, for bounds from above.
 
     Example:
         >>> up(1.2345644, 6), up(-0.12349), up(2.0), up(5.17e-9, 2)
@@ -39,16 +24,7 @@ def up(value: float, digits: int = 4) -> str:
 
 
 def down(value: float, digits: int = 4) -> str:
-    """The number with so many digits, rounded down: for bounds from below.
-
-    Args:
-        value: the number.
-        digits: significant ones.
-
-    Returns:
-        The text; never more than the number.
-
-    Source: none.
+    """The number with so many significant digits, rounded down: never more, for bounds from below.
 
     Example:
         >>> down(0.0110472), down(-1.00001)
@@ -57,41 +33,21 @@ def down(value: float, digits: int = 4) -> str:
     return _rounded(value, digits, ROUND_FLOOR)
 
 
-def shown(statement: Shown, digits: int = 4) -> str:
-    """Value and unit of a statement, rounded to the side on which it is still true.
-
-    Args:
-        statement: of a certificate.
-        digits: significant ones.
-
-    Returns:
-        The text, "" where there is no value; shares in per cent.
-
-    Source: none.
+def shown(statement: Statement, digits: int = 4) -> str:
+    """Value and unit of a statement, rounded to the side on which it is still true; "" without one, shares in per cent.
 
     Example:
         >>> from types import SimpleNamespace
         >>> shown(SimpleNamespace(name="tolerated error", value=0.0110472, unit="latent"))
         '0.01104 latent'
-        >>> shown(SimpleNamespace(name="risk", value=0.00123401, unit="share"))
-        '0.1235 %'
     """
     if statement.value is None:
         return ""
     return _with_unit(statement.value, statement.unit, digits, statement.name in LOWER_BOUNDS)
 
 
-def missed(statement: Shown, digits: int = 3) -> str:
-    """By how much a statement fails, at most; what was found by a search may be exceeded elsewhere.
-
-    Args:
-        statement: of a certificate.
-        digits: significant ones.
-
-    Returns:
-        The text, "" where nothing is known.
-
-    Source: none.
+def missed(statement: Statement, digits: int = 3) -> str:
+    """By how much a statement fails, at most, "" where unknown; what a search found may be exceeded elsewhere.
 
     Example:
         >>> from types import SimpleNamespace

@@ -1,26 +1,26 @@
-"""What fresh episodes show: exact confidence bounds, and the layers of a certificate that are generated from a record."""
+"""What fresh episodes show: exact confidence bounds, and the layers of a certificate that follow from a record."""
 
 from __future__ import annotations
 
 import hashlib
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchrl_sspl.certification.certificate import ASSUMED, MEASURED, REPORTED, Layer, Reason, Statement
+from torchrl_sspl.certification.certificate import ASSUMED, MEASURED, REPORTED, Layer, Reason
 from torchrl_sspl.certification.record import REPEATED, Counts, Record
 from torchrl_sspl.certification.rounding import down
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.seeds import used_before
 
-#: Share and confidence of the statement about the largest error of an episode.
-QUANTILE = 0.99
+_QUANTILE = 0.99  # share of the episodes whose largest errors are bounded
 
 
 def clopper_pearson(events: int, n: int, *, confidence: float = 0.95) -> tuple[float, float]:
-    r"""Exact confidence interval of a share from independent trials.
+    r"""Exact confidence interval of a share from independent trials, lower and upper bound.
 
     .. math:: \left[ \operatorname{Beta}^{-1}(a; k, n - k + 1), \operatorname{Beta}^{-1}(1 - a; k + 1, n - k) \right]
 
@@ -28,15 +28,9 @@ def clopper_pearson(events: int, n: int, *, confidence: float = 0.95) -> tuple[f
     event: 0 of 3000 gives an upper bound of 0.1 % at 95 %.
 
     Args:
-        events: k, number of events.
-        n: number of trials.
-        confidence: c.
-
-    Returns:
-        Lower and upper bound.
-
-    Raises:
-        ConfigError: if the numbers do not fit each other.
+        events: k, number of events, 0 <= k <= n, else ``ConfigError``.
+        n: number of trials, at least one.
+        confidence: c in (0, 1).
 
     Source: Clopper and Pearson (1934).
 
@@ -61,26 +55,9 @@ def clopper_pearson(events: int, n: int, *, confidence: float = 0.95) -> tuple[f
 
 
 def share_upper(events: int, n: int, confidence: float) -> float:
-    r"""One-sided exact upper bound of a share from independent trials; 1 without any trial.
+    r"""One-sided exact upper bound :math:`P \le \operatorname{Beta}^{-1}(c; k + 1, n - k)` of a share, rounded upward.
 
-    .. math:: P \le \operatorname{Beta}^{-1}(c; k + 1, n - k)
-
-    Args:
-        events: k, number of events.
-        n: number of trials.
-        confidence: c.
-
-    Returns:
-        The bound, rounded upward.
-
-    Raises:
-        ConfigError: if the numbers do not fit each other.
-
-    Source: Clopper and Pearson (1934).
-
-    Example:
-        >>> round(share_upper(0, 3000, 0.95), 6)
-        0.000998
+    Of k events in n independent trials, with confidence c; 1 without any trial. Source: Clopper and Pearson (1934).
     """
     if n == 0 or events == n:
         return 1.0
@@ -93,18 +70,10 @@ def share_upper(events: int, n: int, confidence: float) -> float:
 
 
 def quantile_rank(n: int, share: float, confidence: float) -> int | None:
-    r"""Rank whose order statistic bounds a quantile from above, whatever the distribution.
+    r"""Rank, from 1, whose order statistic bounds a quantile of any distribution from above; None if n is too small.
 
     The smallest r with :math:`P(\operatorname{Bin}(n, q) \le r - 1) \ge c`: with confidence c at least a share q of the
     distribution is at most the r-th smallest of n independent values.
-
-    Args:
-        n: number of independent values.
-        share: q.
-        confidence: c.
-
-    Returns:
-        r, counted from 1; None where n values are too few (:math:`1 - q^n < c`).
 
     Source: David and Nagaraja, Order Statistics (2003), section 7.1.
 
@@ -123,16 +92,9 @@ def quantile_rank(n: int, share: float, confidence: float) -> int | None:
 
 
 def fingerprint(rows: Tensor, *, grid: float | None = None) -> list[str]:
-    """A hash of each row in full precision, to find out whether two data sets share any.
+    """A hexadecimal hash of each row in full precision, to find out whether two data sets share any.
 
-    Args:
-        rows: ``(n, ...)``.
-        grid: values are rounded to multiples of it before, where the last digits of a computation may differ.
-
-    Returns:
-        n hexadecimal strings.
-
-    Source: none.
+    Values are rounded to multiples of the grid before, where the last digits of a computation may differ.
 
     Example:
         >>> a, b = fingerprint(torch.tensor([[1, 2], [1, 3]], dtype=torch.uint8))
@@ -148,37 +110,33 @@ def fingerprint(rows: Tensor, *, grid: float | None = None) -> list[str]:
     return [hashlib.blake2b(row.tobytes(), digest_size=16).hexdigest() for row in flat]
 
 
-def statistical_layer(record: Record, *, level: float = 0.0, tolerated_error: float | None = None) -> Layer:
+def statistical_layer(record: Record, *, tolerated_error: float | None = None) -> Layer:
     r"""What holds for fresh episodes, with which confidence; every word and number follows from the record.
 
-    The unit is the episode: steps of one are not independent. An episode that leaves the set, enters U, shows an observation
-    of U with B <= s or gives no number is one event; with k events among n independent episodes
-    :math:`P \le \operatorname{Beta}^{-1}(c'; k + 1, n - k)`. Observations of U have a bound of their own. Both hold at
-    once with confidence c, as each has :math:`c' = 1 - (1 - c) / 2`; a share of episodes and a share of observations are
-    never added.
+    The unit is the episode: steps of one are not independent. An episode that leaves the set, enters U, shows an
+    observation of U with B <= s or gives no number is one event; with k events among n independent episodes :math:`P
+    \le \operatorname{Beta}^{-1}(c'; k + 1, n - k)`. Observations of U have a bound of their own. Both hold at once with
+    confidence c, as each has :math:`c' = 1 - (1 - c) / 2`; a share of episodes and a share of observations are never
+    added.
 
     Args:
         record: how the episodes were drawn, and what was counted.
-        level: s, barrier units.
         tolerated_error: proved, latent units; None where nothing was proved.
-
-    Returns:
-        The layer.
 
     Source: Clopper and Pearson (1934); the paper has no statistical statement.
 
     Example:
         >>> counts = Counts(3000, 600000, 0, 0, 0, 0, 0, 0, 3000, 0, 9000, 0)
-        >>> layer = statistical_layer(Record("resets", "given", 7, 3000, 200, 3000, blocks=[counts]), tolerated_error=0.1)
+        >>> record = Record("resets", "given", 7, 3000, 200, 3000, blocks=[counts])
+        >>> layer = statistical_layer(record, tolerated_error=0.1)
         >>> layer.holds, round(layer["episodes"].value, 5)
         (True, 0.00123)
     """
     layer, total, sizes = Layer("statistical"), record.total, record.sizes
-    add = layer.statements.append
     n, m = total.episodes - sizes["repeated"], total.shown - sizes["leaked"]
     if not total.episodes or not total.shown:
         text = "episodes from {B <= s} and observations of U were measured"
-        add(Statement("sample", text, MEASURED, False, n=min(total.episodes, total.shown), reason=Reason.NOT_MEASURED.name))
+        layer.state(MEASURED, "sample", text, False, Reason.NOT_MEASURED, n=min(total.episodes, total.shown))
         return layer
     _fresh(layer, record)
     _within(layer, total)
@@ -193,25 +151,23 @@ def statistical_layer(record: Record, *, level: float = 0.0, tolerated_error: fl
         f"episodes of at most {record.horizon} steps from {{B <= s}} that leave it, enter U, show U with B <= s or give no "
         f"number: {events} of {n}; at most"
     )
-    add(_share("episodes", text, events, n, each, record.acceptable, reason, detail))
-    what = (
-        "observations of U with B <= s, drawn half uniformly in U and half where one step under a random action enters it"
-        if record.kind == "states"
-        else "episodes with an observation of U that show one with B <= s, half under the policy, half under random actions"
-    )
+    _share(layer, "episodes", text, events, n, each, record.acceptable, reason, detail)
+    if record.kind == "states":
+        what = "observations of U with B <= s, drawn half uniformly in U and half where one step under a random action "
+        what += "enters it"
+        started = "uniformly in the states whose observation lies in the set"
+    else:
+        what = "episodes with an observation of U that show one with B <= s, half under the policy, half under random "
+        what += "actions"
+        started = "as those of the environment's resets that lie in the set"
     text, mistaken = f"{what}: {min(total.mistaken, m)} of {m}; at most", min(total.mistaken, m)
     detail = f"acceptable {record.acceptable:g}"
-    add(_share("unsafe observations", text, mistaken, m, each, record.acceptable, Reason.UNSAFE_INSIDE, detail))
+    _share(layer, "unsafe observations", text, mistaken, m, each, record.acceptable, Reason.UNSAFE_INSIDE, detail)
     text = "both bounds hold at once (each bounds a share of its own kind; they are not added)"
-    add(Statement("together", text, REPORTED, None, confidence=record.confidence))
+    layer.state(REPORTED, "together", text, confidence=record.confidence)
     _errors(layer, record, tolerated_error)
-    started = (
-        "uniformly in the states whose observation lies in the set"
-        if record.kind == "states"
-        else "as those of the environment's resets that lie in the set"
-    )
-    add(Statement("starts", f"episodes start as the measured ones did: {started}", ASSUMED, None))
-    add(Statement("system", "camera, physics and appearance stay as they were", ASSUMED, None))
+    layer.state(ASSUMED, "starts", f"episodes start as the measured ones did: {started}")
+    layer.state(ASSUMED, "system", "camera, physics and appearance stay as they were")
     return layer
 
 
@@ -219,25 +175,21 @@ def _fresh(layer: Layer, record: Record) -> None:
     """Whether nothing was seen before."""
     total, sizes = record.total, record.sizes
     if record.used is None:
-        text = "the episodes are fresh: the agent does not say which seeds it was trained with"
-        layer.statements.append(Statement("fresh", text, ASSUMED, None))
+        layer.state(ASSUMED, "fresh", "the episodes are fresh: the agent does not say which seeds it was trained with")
     else:
         clash = any(used_before(seed, record.used) for seed in record.seeds())
         text = "no seed of these episodes was used to train, choose or tune"
-        reason = Reason.CALIBRATION_REUSED.name if clash else ""
-        layer.statements.append(Statement("fresh", text, MEASURED, not clash, n=len(record.used), reason=reason))
+        layer.state(MEASURED, "fresh", text, not clash, Reason.CALIBRATION_REUSED, n=len(record.used))
     for name, what, known, found, n, reason in (
         ("different", "episodes that repeat another", 1, sizes["repeated"], total.episodes, Reason.CALIBRATION_REUSED),
         ("unseen", "labelled states that were trained on", sizes["trained_on"], sizes["leaked"], total.shown,
          Reason.LABELS_LEAKED),
     ):  # fmt: skip
         if not known:
-            text = "no labelled state was trained on: the agent does not say which were"
-            layer.statements.append(Statement(name, text, ASSUMED, None))
+            layer.state(ASSUMED, name, "no labelled state was trained on: the agent does not say which were")
             continue
         fails = found > REPEATED * n
-        text = f"{what}, which do not count: {found} of {n}"
-        layer.statements.append(Statement(name, text, MEASURED, not fails, n=n, reason=reason.name if fails else ""))
+        layer.state(MEASURED, name, f"{what}, which do not count: {found} of {n}", not fails, reason, n=n)
 
 
 def _within(layer: Layer, total: Counts) -> None:
@@ -247,31 +199,28 @@ def _within(layer: Layer, total: Counts) -> None:
          Reason.NOT_FINITE),
         ("encoder", "latents of fresh observations outside the domain", total.outside, total.seen, Reason.OUTSIDE_DOMAIN),
     ):  # fmt: skip
-        layer.statements.append(
-            Statement(name, f"{text}: {wrong}", MEASURED, not wrong, n=n, reason=reason.name if wrong else "")
-        )
+        layer.state(MEASURED, name, f"{text}: {wrong}", not wrong, reason, n=n)
 
 
 def _share(
-    name: str, text: str, events: int, n: int, confidence: float, acceptable: float, reason: Reason, detail: str
-) -> Statement:
-    """A bound that has to be acceptable; no event among so few that even none proves little is no fault of the agent."""
-    bound = share_upper(events, n, confidence)
+    layer: Layer, name: str, text: str, events: int, n: int, each: float, acceptable: float, reason: Reason, detail: str
+) -> None:
+    """States a bound that has to be acceptable; few episodes without any event are no fault of the agent."""
+    bound = share_upper(events, n, each)
     holds = bound <= acceptable
     why = Reason.TOO_FEW if events == 0 else reason
-    missed = None if holds else bound - acceptable
-    return Statement(
-        name, text, MEASURED, holds, bound, "share", n, confidence, "" if holds else why.name, missed, detail
-    )
+    of = {"value": bound, "unit": "share", "n": n, "confidence": each, "detail": detail}
+    layer.state(MEASURED, name, text, holds, why, misses_by=None if holds else bound - acceptable, **of)
 
 
 def _errors(layer: Layer, record: Record, tolerated: float | None) -> None:
     """How the errors compare with what is proved to be tolerated; reported, as nothing above rests on it."""
-    add, total, numbers = layer.statements.append, record.total, record.numbers
+    total, numbers = record.total, record.numbers
     n = total.episodes - record.sizes["repeated"]
+    of: dict[str, Any] = {"n": n, "confidence": record.confidence}
     if tolerated is None or tolerated <= 0:
         text = "no error is proved to be tolerated, so the proof says nothing about episodes"
-        add(Statement("errors tolerated", text, REPORTED, None, n=n))
+        layer.state(REPORTED, "errors tolerated", text, n=n)
     else:
         exceeding = min(total.exceeding, n)
         text = (
@@ -279,13 +228,13 @@ def _errors(layer: Layer, record: Record, tolerated: float | None) -> None:
             f"{exceeding} of {n}; at most"
         )
         bound = share_upper(exceeding, n, record.confidence)
-        add(Statement("errors tolerated", text, REPORTED, None, bound, "share", n, record.confidence))
+        layer.state(REPORTED, "errors tolerated", text, value=bound, unit="share", **of)
     if numbers["episode_error"] is not None:
-        text = f"a share of at least {QUANTILE:g} of the episodes has errors of at most"
-        add(Statement("largest error", text, REPORTED, None, numbers["episode_error"], "latent", n, record.confidence))
+        text = f"a share of at least {_QUANTILE:g} of the episodes has errors of at most"
+        layer.state(REPORTED, "largest error", text, value=numbers["episode_error"], unit="latent", **of)
     for name, steps, largest in record.rims:
         text = f"largest error seen on steps that begin {name}; steps are dependent, so no bound follows"
-        add(Statement(f"error {name}", text, REPORTED, None, largest, "latent", steps))
+        layer.state(REPORTED, f"error {name}", text, value=largest, unit="latent", n=steps)
 
 
 def paper_numbers(
@@ -298,7 +247,7 @@ def paper_numbers(
     dynamics_error: float,
     closed_loop_constant: float,
 ) -> tuple[dict[str, int], dict[str, float]]:
-    r"""What the paper's conditions need of a sample, as entries of a record.
+    r"""What the paper's conditions (eq. (3)-(5)) need of a sample: whole numbers and numbers of a record, by name.
 
     Args:
         safe: ``(n,)`` barrier values of held-out observations of S.
@@ -308,11 +257,6 @@ def paper_numbers(
         covering_radius: :math:`\bar\epsilon`, latent units.
         dynamics_error: :math:`\delta`, latent units.
         closed_loop_constant: certified Lipschitz constant of :math:`z \mapsto d(z, \pi(z))`.
-
-    Returns:
-        Whole numbers and numbers by name.
-
-    Source: paper eq. (3)-(5).
     """
     psi, eta = lipschitz_bound * covering_radius, lipschitz_bound * dynamics_error
     needed = psi * (closed_loop_constant + 1.0)
@@ -337,18 +281,16 @@ def paper_layer(record: Record, lipschitz_bound: float) -> Layer:
         record: with the entries of :func:`paper_numbers`.
         lipschitz_bound: :math:`L_B`.
 
-    Returns:
-        The layer.
-
     Source: paper eq. (3)-(5) and Theorem 1; deviations: q1, q2, q3 are asked where they make sense (S, U, the set), and
     :math:`\psi_3` is given in both forms.
 
     Example:
-        >>> sizes, numbers = paper_numbers(safe=torch.tensor([-1.0]), unsafe=torch.tensor([1.0]), following=torch.tensor([-0.1]),
-        ...     lipschitz_bound=2.0, covering_radius=0.1, dynamics_error=0.01, closed_loop_constant=1.5)
+        >>> value = torch.tensor([1.0])
+        >>> sizes, numbers = paper_numbers(safe=-value, unsafe=value, following=-0.1 * value, lipschitz_bound=2.0,
+        ...     covering_radius=0.1, dynamics_error=0.01, closed_loop_constant=1.5)
         >>> layer = paper_layer(Record("resets", "given", 7, 1, 200, sizes=sizes, numbers=numbers), 2.0)
-        >>> layer.holds, layer.verdict
-        (False, "not certified: q3 (a condition does not hold on the held-out samples with the paper's margins, misses by 0.12 barrier)")
+        >>> [s.holds for s in layer.statements]
+        [None, None, None, True, True, False, False]
     """
     layer, sizes = Layer("paper"), record.sizes
     number = {k: math.nan if v is None else v for k, v in record.numbers.items()}
@@ -357,55 +299,35 @@ def paper_layer(record: Record, lipschitz_bound: float) -> Layer:
     for name, text, value in (
         ("safety margin", "psi* = L_B eps-bar, sampled", psi),
         ("dynamics margin", "eta* = L_B delta, sampled", eta),
-        (
-            "safety margin of q3",
-            "psi* with the Lipschitz constant that the proof of q3 needs, L_B (L_cl + 1) eps-bar",
-            psi3,
-        ),
-    ):
-        layer.statements.append(Statement(name, text, REPORTED, None, value, "barrier"))
+        ("safety margin of q3", "psi* with the Lipschitz constant that the proof of q3 needs, L_B (L_cl + 1) eps-bar",
+         psi3),
+    ):  # fmt: skip
+        layer.state(REPORTED, name, text, value=value, unit="barrier")
     for name, text, kind, margin, met in (
         ("q1", "B + psi* <= 0 on held-out observations of S", "safe", psi, "safe_met"),
         ("q2", "-B + psi* <= 0 on held-out observations of U", "unsafe", psi, "unsafe_met"),
         ("q3", "B(d(z, pi(z))) + psi* + eta* <= 0 on {B <= s}", "following", psi + eta, "following_met"),
-        (
-            "q3 as its proof needs it",
-            "the same with the margin that the proof needs",
-            "following",
-            psi3 + eta,
-            "following_met_as_needed",
-        ),
-    ):
+        ("q3 as its proof needs it", "the same with the margin that the proof needs", "following", psi3 + eta,
+         "following_met_as_needed"),
+    ):  # fmt: skip
         n, worst = sizes[kind], number[f"{kind}_worst"] + margin
         if not n or not math.isfinite(worst):
             reason = Reason.NOT_FINITE if n else Reason.NOT_MEASURED
-            layer.statements.append(Statement(name, text, MEASURED, False, n=n, reason=reason.name))
+            layer.state(MEASURED, name, text, False, reason, n=n)
             continue
-        holds = worst <= 0
-        reason_name, missed = ("", None) if holds else (Reason.CONDITION_FAILS.name, worst)
+        of = {"value": worst, "misses_by": None if worst <= 0 else worst, "unit": "barrier", "n": n}
         detail = f"holds on {100 * sizes[met] / n:.4g} % of the samples"
-        layer.statements.append(
-            Statement(name, f"{text}: worst excess", MEASURED, holds, worst, "barrier", n, None, reason_name, missed, detail)
-        )
+        layer.state(MEASURED, name, f"{text}: worst excess", worst <= 0, Reason.CONDITION_FAILS, detail=detail, **of)
     return layer
 
 
 def largest_error_bound(errors: Sequence[float] | Tensor, confidence: float) -> float:
-    """Upper confidence bound of the 99 % quantile of independent episodes' largest errors.
-
-    Args:
-        errors: ``(n,)`` one of each episode.
-        confidence: c.
-
-    Returns:
-        The bound; NaN where the episodes are too few.
-
-    Source: see :func:`quantile_rank`.
+    """Upper confidence bound of the 99 % quantile of independent episodes' errors ``(n,)``; NaN where they are too few.
 
     Example:
         >>> largest_error_bound(torch.arange(1000.0), 0.95) >= 990.0
         True
     """
     ordered = torch.as_tensor(errors, dtype=torch.float64).sort().values  # NaN last
-    rank = quantile_rank(len(ordered), QUANTILE, confidence)
+    rank = quantile_rank(len(ordered), _QUANTILE, confidence)
     return math.nan if rank is None else float(ordered[rank - 1])

@@ -313,7 +313,7 @@ def _tolerated(certificate: Certificate) -> float | None:
 
 def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> dict[str, Layer]:
     return {
-        "statistical": statistical_layer(record, level=certificate.level, tolerated_error=_tolerated(certificate)),
+        "statistical": statistical_layer(record, tolerated_error=_tolerated(certificate)),
         "paper": paper_layer(record, agent.lipschitz_bound),
     }
 

@@ -18,16 +18,11 @@ def lipschitz_upper(network: nn.Module | Sequence[Tensor], slope: Slope | None =
     """Smallest Lipschitz bound that can be proved for a network (within the accuracy of an interior-point method).
 
     Args:
-        network: plain network or its weights.
+        network: plain network or its weights, as for :func:`~torchrl_sspl.lipschitz.layer_weights`.
         slope: smallest and largest slope of the activation; read from the network if not given.
 
     Returns:
         A bound that :func:`prove_lipschitz` accepts, at least 1e-6; infinity if there is none in reach of float64.
-
-    Raises:
-        ConfigError: if the slopes do not contain those of the network, or the module is no plain network.
-        ShapeError: if the shapes of the weights do not follow each other.
-        NonFiniteError: if a weight is NaN or infinite.
 
     Source: paper Lemma 2; Fazlyab et al. 2019 (LipSDP-Neuron).
 
@@ -54,7 +49,7 @@ def lipschitz_lower(
     *,
     dim: int | None = None,
 ) -> float:
-    """Largest slope of a scalar function that was seen in samples: no Lipschitz constant can be smaller.
+    """Largest gradient norm of a scalar function that was seen in samples: no Lipschitz constant can be smaller.
 
     A third of the samples is uniform, the others lie around the steepest found so far.
 
@@ -64,13 +59,7 @@ def lipschitz_lower(
         high: upper corner.
         n: number of gradients in each of three passes.
         generator: random numbers; the samples are drawn where it lives.
-        dim: p; taken from the corners or the first linear layer if not given.
-
-    Returns:
-        The largest gradient norm.
-
-    Raises:
-        ConfigError: if the size of the input is not known.
+        dim: p; taken from the corners or the first linear layer if not given, else ``ConfigError``.
 
     Source: none.
 

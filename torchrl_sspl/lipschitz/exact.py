@@ -57,7 +57,7 @@ def prove_lipschitz(
     *,
     multipliers: Sequence[Tensor] | None = None,
 ) -> LipschitzProof:
-    r"""Proves, in exact arithmetic on the deployed weights, that a network is L-Lipschitz.
+    r"""Proves, in exact arithmetic on the deployed weights, that a network is L-Lipschitz, or says why it could not.
 
     .. math:: D M(\theta, \Lambda) D = F F^\top + R, \quad R_{ii} \ge \sum_{j \ne i} |R_{ij}| \;\Rightarrow\; M \succeq 0
 
@@ -68,12 +68,9 @@ def prove_lipschitz(
         multipliers: diagonals of Lambda; searched for if not given. They are a witness: no choice of them can make
             a false claim pass.
 
-    Returns:
-        The proof, or the reason why the claim was not proved.
-
     Raises:
-        ConfigError: if the bound is not positive, the slopes do not contain those of the network, or the module is no
-            plain network.
+        ConfigError: if the bound is not positive, the slopes do not contain those of the network, or it is no plain
+            network.
         ShapeError: if the shapes of weights and multipliers do not fit.
         NonFiniteError: if a weight is NaN or infinite.
 
@@ -123,10 +120,7 @@ def prove_lipschitz(
 
 
 def _exact_square(factor: np.ndarray) -> np.ndarray:
-    """``F F^T`` in units of ``2**(-2 * _FACTOR_BITS)``, exactly, for F rounded to ``_FACTOR_BITS`` and entries up to 1.
-
-    Halves of the digits multiply without overflow in 64 bits, at the speed of the machine.
-    """
+    """``F F^T`` in units of ``2**(-2 * _FACTOR_BITS)``, exactly, of F rounded to ``_FACTOR_BITS``, entries up to 1."""
     half = _FACTOR_BITS // 2
     whole = np.round(factor * 2.0**_FACTOR_BITS).astype(np.int64)
     high, low = whole >> half, whole & ((1 << half) - 1)

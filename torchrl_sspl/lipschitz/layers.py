@@ -1,16 +1,8 @@
-r"""The layers that proofs understand, in one list: values, slopes, linear relaxations and rounding of each.
+"""The layers that proofs understand, in one list: values, slopes, linear relaxations and rounding of each.
 
-:data:`LAYERS` is all that the Lipschitz proof, bound propagation, the comparison with what is deployed and the statement
-about floating-point numbers know of a layer; to add one is to add one entry. Modules are known by their exact type: a
-subclass may compute anything.
-
-For an activation :math:`\sigma` and an interval :math:`[l, u]` a relaxation is a pair of lines with
-
-.. math:: a_l x + b_l \le \sigma(x) \le a_u x + b_u \qquad \text{for all } x \in [l, u].
-
-Whatever slope is chosen, the offset is the extreme of :math:`\sigma(x) - a x`. A piecewise linear activation takes it
-at an end of the interval or at a knot. For smooth ones it is evaluated on a grid, and what it may do between two grid
-points is bounded by the second derivative: no search, no tolerance.
+:data:`LAYERS` is all that the Lipschitz proof, bound propagation, the comparison with what is deployed and the
+statement about floating-point numbers know of a layer; to add one is to add one entry. Modules are known by their exact
+type: a subclass may compute anything.
 """
 
 from __future__ import annotations
@@ -31,14 +23,7 @@ _GRID = 17  # points per interval for smooth activations
 
 
 class Relaxation(NamedTuple):
-    """Lines below and above an activation on an interval, each part ``(*batch,)``.
-
-    Attributes:
-        lower_slope: slope of the line below.
-        lower_offset: offset of the line below.
-        upper_slope: slope of the line above.
-        upper_offset: offset of the line above.
-    """
+    """Lines below and above an activation on an interval, each part ``(*batch,)``."""
 
     lower_slope: Tensor
     lower_offset: Tensor
@@ -48,7 +33,13 @@ class Relaxation(NamedTuple):
 
 @dataclass(frozen=True)
 class Activation:
-    r"""Scalar function that is applied to every entry.
+    r"""Scalar function :math:`\sigma` that is applied to every entry; intervals and results are ``(*batch,)``.
+
+    A relaxation is a pair of lines :math:`a_l x + b_l \le \sigma(x) \le a_u x + b_u` on an interval. Whatever slope is
+    chosen, the offset is the extreme of :math:`\sigma(x) - a x`. A piecewise linear function takes it at an end of the
+    interval or at a knot. For smooth ones it is evaluated on a grid, and what it may do between two grid points is
+    bounded by the second
+    derivative: no search, no tolerance.
 
     Attributes:
         name: for messages and certificates.
@@ -71,21 +62,7 @@ class Activation:
     jump: float = 0.0
 
     def interval(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """Range of the function on intervals.
-
-        Args:
-            lower: ``(*batch,)``.
-            upper: ``(*batch,)``.
-
-        Returns:
-            Lower and upper ends, ``(*batch,)``.
-
-        Source: none.
-
-        Example:
-            >>> [t.tolist() for t in activation_of(nn.ReLU()).interval(torch.tensor([-1.0]), torch.tensor([2.0]))]
-            [[0.0], [2.0]]
-        """
+        """Range of the function on intervals, lower and upper ends."""
         first, last = self.value(lower), self.value(upper)
         low, high = torch.minimum(first, last), torch.maximum(first, last)
         if self.minimum is not None:
@@ -95,21 +72,9 @@ class Activation:
         return low, high
 
     def parallel(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        r"""Parallel lines around the function, :math:`|\sigma(x) - (a x + b)| \le g`.
-
-        Args:
-            lower: ``(*batch,)``.
-            upper: ``(*batch,)``.
-
-        Returns:
-            Slope a, offset b and gap g, each ``(*batch,)``.
+        r"""Slope a, offset b and gap g of parallel lines around the function, :math:`|\sigma(x) - (a x + b)| \le g`.
 
         Source: none; for ReLU the parallelogram of Singh et al. 2018.
-
-        Example:
-            >>> slope, offset, gap = activation_of(nn.ReLU()).parallel(torch.tensor([-1.0]), torch.tensor([1.0]))
-            >>> slope.item(), offset.item(), gap.item()
-            (0.5, 0.25, 0.25)
         """
         slope = self._chord(lower, upper)
         low, high = self._offsets(slope, lower, upper)
@@ -121,17 +86,10 @@ class Activation:
         return slope, 0.5 * (high + low), 0.5 * (high - low)
 
     def relax(self, lower: Tensor, upper: Tensor) -> Relaxation:
-        r"""Lines below and above the function.
+        """Lines below and above the function.
 
         Of a piecewise linear function these are the edges of its convex and its concave hull that leave the least
         area, of a smooth one two parallel lines.
-
-        Args:
-            lower: ``(*batch,)``.
-            upper: ``(*batch,)``.
-
-        Returns:
-            The relaxation.
 
         Source: Zhang et al. 2018 (CROWN) with adaptive slopes; a clamp is one function here, not two ReLUs.
 
@@ -163,21 +121,7 @@ class Activation:
         return best
 
     def slopes(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """Smallest and largest slope of the function on intervals.
-
-        Args:
-            lower: ``(*batch,)``.
-            upper: ``(*batch,)``.
-
-        Returns:
-            Both, ``(*batch,)``.
-
-        Source: none.
-
-        Example:
-            >>> [t.tolist() for t in activation_of(nn.ReLU()).slopes(torch.tensor([-1.0, 1.0]), torch.tensor([2.0, 2.0]))]
-            [[0.0, 1.0], [1.0, 1.0]]
-        """
+        """Smallest and largest slope of the function on intervals."""
         if self.curvature:  # a chord has the slope of some point between; it cannot change faster than the curvature
             wide = (upper - lower).clamp_min(1e-6)
             chord, change = self._chord(lower, lower + wide), self.curvature * wide * (1 + 1e-6) + 1e-9
@@ -219,8 +163,6 @@ class Activation:
 class Abs(nn.Module):
     """Absolute value as a module, for networks that certification should understand.
 
-    Source: none.
-
     Example:
         >>> Abs()(torch.tensor([-2.0]))
         tensor([2.])
@@ -232,19 +174,7 @@ class Abs(nn.Module):
 
 
 def clamp(low: float = -1.0, high: float = 1.0) -> Activation:
-    """The clamp to an interval.
-
-    Args:
-        low: lower end.
-        high: upper end.
-
-    Returns:
-        The activation.
-
-    Raises:
-        ConfigError: if the interval is empty.
-
-    Source: none.
+    """The clamp to an interval, ``low < high``.
 
     Example:
         >>> clamp().value(torch.tensor([-3.0, 0.5]))
@@ -252,9 +182,8 @@ def clamp(low: float = -1.0, high: float = 1.0) -> Activation:
     """
     if not low < high:
         raise ConfigError(f"expected low < high, received {low} and {high}")
-    return Activation(
-        f"Clamp({low:g}, {high:g})", lambda x: x.clamp(low, high), (0.0, 1.0), (low, high), jump=_off(low, high)
-    )
+    name = f"Clamp({low:g}, {high:g})"
+    return Activation(name, lambda x: x.clamp(low, high), (0.0, 1.0), (low, high), jump=_off(low, high))
 
 
 def _off(*constants: float) -> float:
@@ -279,9 +208,7 @@ def _softplus(module: Any) -> Activation:
         )
     smooth = lambda x: F.softplus(x, beta=b, threshold=700.0)  # noqa: E731
     jump = math.exp(-threshold) / b * (1 + 1e-9)
-    return Activation(
-        f"Softplus({b:g})", smooth, (0.0, 1.0), curvature=0.25 * b * (1 + 1e-9), ulps=8.0, jump=jump
-    )
+    return Activation(f"Softplus({b:g})", smooth, (0.0, 1.0), curvature=0.25 * b * (1 + 1e-9), ulps=8.0, jump=jump)
 
 
 def _gelu(module: Any) -> Activation:
@@ -317,24 +244,10 @@ COLLAPSIBLE: set[type[nn.Module]] = set()
 
 
 def known_form(form: str) -> Callable[[type], type]:
-    """Decorator of a module whose forward has one of the forms of :data:`FORMS`; values are compared nevertheless.
-
-    Args:
-        form: "residual" or "bounded".
-
-    Returns:
-        The decorator.
-
-    Raises:
-        ConfigError: if the form is another one.
-
-    Source: none.
+    """Decorator of a module whose forward is "residual" or "bounded" (:data:`FORMS`); values are compared nevertheless.
 
     Example:
-        >>> @known_form("bounded")
-        ... class Mine(nn.Module):
-        ...     pass
-        >>> FORMS.pop(Mine)
+        >>> FORMS.pop(known_form("bounded")(type("Mine", (nn.Module,), {})))
         'bounded'
     """
     if form not in ("residual", "bounded"):
@@ -348,33 +261,14 @@ def known_form(form: str) -> Callable[[type], type]:
 
 
 def collapsible(kind: type) -> type:
-    """Decorator of a module whose ``collapse()`` gives the plain network that is deployed.
-
-    Source: none.
-
-    Example:
-        >>> from torchrl_sspl.lipschitz import SandwichBarrier
-        >>> SandwichBarrier in COLLAPSIBLE
-        True
-    """
+    """Decorator of a module whose ``collapse()`` gives the plain network that is deployed."""
     COLLAPSIBLE.add(kind)
     ORIGINAL[kind] = kind.forward  # type: ignore[attr-defined]
     return kind
 
 
 def activation_of(module: nn.Module) -> Activation:
-    """What is known of an activation.
-
-    Args:
-        module: one of :data:`LAYERS` that is not linear.
-
-    Returns:
-        The activation.
-
-    Raises:
-        StructureError: if the module is none of these, or has parameters for which no bound is known.
-
-    Source: none.
+    """What is known of an activation, one of :data:`LAYERS` that is not linear, else ``StructureError``.
 
     Example:
         >>> activation_of(nn.LeakyReLU(0.5)).slope

@@ -25,26 +25,21 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
 class LMIBarrier(nn.Module):
     r"""Network with trainable multipliers whose matrix :math:`M(\theta, \Lambda)` stays positive definite.
 
-    It starts feasible: the weights are scaled so that :math:`\rho = \beta^l \prod_k \|W_k\| / L < 1`, and the
-    multipliers are those of :func:`~torchrl_sspl.lipschitz.multipliers.start_multipliers`. Steps are taken through :meth:`backtracking_step`, which
-    never leaves the cone, so that the bound holds at every moment of the training.
+    It starts feasible: the weights are scaled so that :math:`\rho = \beta^l \prod_k \|W_k\| / L < 1`. Steps are taken
+    through :meth:`backtracking_step`, which never leaves the cone: the bound holds at every moment of the training.
 
     Args:
-        latent_dim: size p of the latent.
+        latent_dim: size p of the latent; ``ConfigError`` if this or another argument is not valid.
         hidden: widths of the hidden layers, at least one.
-        lipschitz_bound: L.
+        lipschitz_bound: L > 0.
         activation: one of ``ACTIVATIONS``.
-        start_ratio: :math:`\rho` at the start.
-
-    Raises:
-        ConfigError: if a size, the bound, the ratio or the activation is not valid.
+        start_ratio: :math:`\rho` at the start, in (0, 1).
 
     Source: paper Lemma 2 and eq. (9) (Pauli et al. 2021); deviation: the cone is never left.
 
     Example:
-        >>> _ = torch.manual_seed(0)
         >>> barrier = LMIBarrier(2, (8, 8), lipschitz_bound=2.0)
-        >>> bool(torch.linalg.eigvalsh(barrier.matrix())[0] > 0), barrier(torch.zeros(5, 2)).shape
+        >>> barrier.feasible(), barrier(torch.zeros(5, 2)).shape
         (True, torch.Size([5, 1]))
     """
 

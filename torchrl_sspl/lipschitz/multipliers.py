@@ -13,16 +13,7 @@ from torchrl_sspl.lipschitz.network import Slope, layer_weights, slope_interval
 
 
 def norm_product(weights: Sequence[Tensor], slope: Slope = (0.0, 1.0)) -> float:
-    r"""Crude Lipschitz bound, :math:`\max(|\alpha|, |\beta|)^l \prod_k \|W_k\|_2`.
-
-    Args:
-        weights: :math:`W_0 .. W_l`, each ``(out, in)``.
-        slope: smallest and largest slope of the activation.
-
-    Returns:
-        The product.
-
-    Source: none.
+    r"""Crude Lipschitz bound, :math:`\max(|\alpha|, |\beta|)^l \prod_k \|W_k\|_2`, from weights ``(out, in)``.
 
     Example:
         >>> norm_product([torch.eye(2), torch.tensor([[3.0, 4.0]])])
@@ -33,7 +24,7 @@ def norm_product(weights: Sequence[Tensor], slope: Slope = (0.0, 1.0)) -> float:
 
 
 def start_multipliers(weights: Sequence[Tensor], lipschitz_bound: float, slope: Slope = (0.0, 1.0)) -> list[float]:
-    r"""Multiples of the identity that are feasible for a bound above the product of the norms.
+    r"""Multiples of the identity, one per hidden layer, that are feasible for a bound above the product of the norms.
 
     .. math::
         \Lambda_{k+1} = \frac{a_{k+1}}{1 - \alpha / \beta} I, \quad a_0 = L^2, \quad
@@ -41,19 +32,7 @@ def start_multipliers(weights: Sequence[Tensor], lipschitz_bound: float, slope: 
 
     for :math:`\alpha < \beta`, :math:`|\alpha| \le \beta`; slopes that are steeper below zero are reflected.
 
-    Args:
-        weights: :math:`W_0 .. W_l`, each ``(out, in)``.
-        lipschitz_bound: L, larger than :func:`norm_product`.
-        slope: smallest and largest slope of the activation.
-
-    Returns:
-        One number per hidden layer.
-
     Source: none (Pauli et al. 2021 give no start).
-
-    Example:
-        >>> start_multipliers([torch.ones(1, 1), torch.ones(1, 1)], 2.0)
-        [2.0]
     """
     alpha, beta = slope if slope[1] >= -slope[0] else (-slope[1], -slope[0])
     # A layer without weights costs nothing; a tiny norm in its place keeps the numbers finite.
@@ -71,24 +50,12 @@ def minimise_bound(
 ) -> tuple[list[Tensor], float]:
     r"""Smallest provable bound, by Newton's method on :math:`t L^2 - \log\det M - \sum \log \lambda` for growing t.
 
-    M is linear in the multipliers and in :math:`L^2`, every multiplier entering with rank two, so that the Hessian is
-    a product of small matrices. Every iterate is feasible.
-
-    Args:
-        weights: :math:`W_0 .. W_l`, each ``(out, in)``, float64, at least two.
-        slope: smallest and largest slope of the activation.
-        target: stop as soon as the bound is below this.
-        accuracy: relative accuracy of :math:`L^2` at the end.
-
-    Returns:
-        Multipliers, one vector per hidden layer, and the bound that they make the matrix positive definite for.
+    M is linear in the multipliers and in :math:`L^2`, every multiplier entering with rank two, so that the Hessian is a
+    product of small matrices. Every iterate is feasible. The weights are float64, at least two; it stops below the
+    target, or where :math:`L^2` has this relative accuracy. Returns a vector per hidden layer, and the bound that they
+    prove.
 
     Source: Fazlyab et al. 2019 (LipSDP-Neuron); the method is none of theirs.
-
-    Example:
-        >>> one = torch.ones(1, 1, dtype=torch.float64)
-        >>> round(minimise_bound([0.5 * one, one])[1], 3)
-        0.5
     """
     weights, units = _balanced(weights)
     sizes = [weights[0].shape[1], *(w.shape[0] for w in weights)]

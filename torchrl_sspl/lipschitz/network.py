@@ -19,26 +19,20 @@ _CALL = nn.Module.__call__
 
 
 def check_module(module: nn.Module) -> None:
-    """Refuses a module that may compute something else than its type and its weights say.
-
-    Args:
-        module: a layer, an ``nn.Sequential``, or a module of a registered form (see :mod:`.layers`); its children are not
-            looked at.
+    """Refuses a module, its children aside, that may compute something else than its type and its weights say.
 
     Raises:
-        StructureError: if the type is not exactly one that is known; if a hook (of the module or of all modules), an
-            overridden, replaced or compiled method or a parametrization stands between the weights and what is computed.
+        StructureError: if the type is not exactly one that is known (:mod:`.layers`); if a hook (of the module or of
+            all modules), an overridden, replaced or compiled method or a parametrization stands in between.
         NonFiniteError: if a weight is NaN or infinite.
-
-    Source: none.
 
     Example:
         >>> layer = nn.Linear(2, 1)
-        >>> check_module(layer)
         >>> layer.forward = lambda x: 0 * x
         >>> check_module(layer)
         Traceback (most recent call last):
-        torchrl_sspl.errors.StructureError: expected a Linear whose methods are its own, received one with 'forward' replaced
+        torchrl_sspl.errors.StructureError: expected a Linear whose methods are its own, received one with 'forward'
+        replaced
     """
     kind, name = type(module), type(module).__name__
     known = (*LAYERS, nn.Sequential, *FORMS, *COLLAPSIBLE)
@@ -81,20 +75,10 @@ def check_module(module: nn.Module) -> None:
 
 
 def flat_layers(network: nn.Module) -> list[nn.Module]:
-    """The layers of a plain network in order, after a look at each; those that do nothing are left out.
+    """The layers of a plain network in order, each looked at (:func:`check_module`); what does nothing is left out.
 
-    Args:
-        network: a layer, an ``nn.Sequential`` of such, possibly nested, or a registered module with a ``collapse()``
-            method that gives one.
-
-    Returns:
-        The layers.
-
-    Raises:
-        StructureError: if one may compute something else than its type and its weights say.
-        NonFiniteError: if a weight is NaN or infinite.
-
-    Source: none.
+    A plain network is a layer, an ``nn.Sequential`` of such, possibly nested, or a registered module whose
+    ``collapse()`` gives one.
 
     Example:
         >>> [type(layer).__name__ for layer in flat_layers(nn.Sequential(nn.Linear(2, 2), nn.Sequential(nn.ReLU())))]
@@ -110,25 +94,8 @@ def flat_layers(network: nn.Module) -> list[nn.Module]:
     return [] if type(network) is nn.Identity else [network]
 
 
-def plain_layers(network: nn.Module) -> tuple[list[nn.Linear], list[Slope]]:
-    r"""Linear layers of a plain network, and the slopes of what stands between them.
-
-    Args:
-        network: see :func:`flat_layers`; linear layers with at most one activation between two of them.
-
-    Returns:
-        The layers, and one interval of slopes per gap between two layers.
-
-    Raises:
-        StructureError: if the module is anything else: what is proved of its weights would not hold for it.
-        NonFiniteError: if a weight is NaN or infinite.
-
-    Source: none.
-
-    Example:
-        >>> plain_layers(nn.Sequential(nn.Linear(2, 8), nn.LeakyReLU(0.5), nn.Linear(8, 1)))[1]
-        [(0.5, 1.0)]
-    """
+def _plain_layers(network: nn.Module) -> tuple[list[nn.Linear], list[Slope]]:
+    """Linear layers of a plain network, and one interval of slopes for what stands between two of them."""
     layers: list[nn.Linear] = []
     slopes: list[Slope] = []
     after_linear = False
@@ -153,16 +120,14 @@ def plain_layers(network: nn.Module) -> tuple[list[nn.Linear], list[Slope]]:
 
 
 def layer_weights(network: nn.Module | Sequence[Tensor]) -> list[Tensor]:
-    """Weight matrices of a plain network, in order.
+    """Weight matrices ``(out, in)`` of a plain network, in order, detached, in host memory, where bounds are computed.
 
     Args:
-        network: plain network (see :func:`plain_layers`), or the weights themselves.
-
-    Returns:
-        One ``(out, in)`` matrix per linear layer, detached, in host memory, where bounds are computed.
+        network: plain network (linear layers with at most one activation between two of them), or the weights
+            themselves.
 
     Raises:
-        ConfigError: if the module is no plain network.
+        ConfigError: if the module is no plain network: what is proved of its weights would not hold for it.
         ShapeError: if the shapes do not follow each other.
         NonFiniteError: if a weight is NaN or infinite.
 
@@ -173,7 +138,7 @@ def layer_weights(network: nn.Module | Sequence[Tensor]) -> list[Tensor]:
         [(8, 2), (1, 8)]
     """
     if isinstance(network, nn.Module):
-        weights = [layer.weight.detach().cpu() for layer in plain_layers(network)[0]]
+        weights = [layer.weight.detach().cpu() for layer in _plain_layers(network)[0]]
     else:
         weights = [w.detach().cpu() for w in network]
     if not weights or any(w.ndim != 2 for w in weights):
@@ -192,18 +157,14 @@ def layer_weights(network: nn.Module | Sequence[Tensor]) -> list[Tensor]:
 
 
 def slope_interval(network: nn.Module | Sequence[Tensor], slope: Slope | None = None) -> Slope:
-    r"""Slopes :math:`[\alpha, \beta]` of the activations of a network.
+    r"""Smallest and largest slope :math:`[\alpha, \beta]` of the activations of a network.
 
     Args:
-        network: plain network, or its weights.
-        slope: interval to use; it must contain the slopes of the network's activations. Without it they are read
-            from the network; weights alone stand for a ReLU network.
+        network: plain network, or its weights, which alone stand for a ReLU network.
+        slope: interval to use in place of the network's own, which it must contain, else ``ConfigError``.
 
     Returns:
-        Smallest and largest slope; an interval (almost) without width is widened downward, which costs nothing.
-
-    Raises:
-        ConfigError: if the given interval is not one, or does not contain the slopes of the network.
+        Both; an interval (almost) without width is widened downward, which costs nothing.
 
     Source: none.
 
@@ -211,7 +172,7 @@ def slope_interval(network: nn.Module | Sequence[Tensor], slope: Slope | None = 
         >>> slope_interval(nn.Sequential(nn.Linear(2, 8), nn.SiLU(), nn.Linear(8, 1)))
         (-0.1, 1.1)
     """
-    found = plain_layers(network)[1] if isinstance(network, nn.Module) else []
+    found = _plain_layers(network)[1] if isinstance(network, nn.Module) else []
     if slope is None:
         slope = (min(low for low, _ in found), max(high for _, high in found)) if found else (0.0, 1.0)
     low, high = slope

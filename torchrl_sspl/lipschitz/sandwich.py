@@ -18,17 +18,11 @@ _SHRINK = 1e-5
 
 
 def cayley(weight: Tensor) -> Tensor:
-    r"""Matrix with orthonormal columns (or rows) from a free matrix.
+    r"""Matrix ``(n, m)`` with orthonormal columns (rows, if n < m) from a free matrix of its shape.
 
     .. math:: Q = \begin{bmatrix} (I + Z)^{-1} (I - Z) \\ -2 V (I + Z)^{-1} \end{bmatrix}, \quad Z = U - U^\top + V^\top V
 
     with U the upper square and V the rest of the matrix.
-
-    Args:
-        weight: ``(n, m)``.
-
-    Returns:
-        ``(n, m)``; orthonormal columns if n >= m, else orthonormal rows.
 
     Source: Wang & Manchester 2023, eq. (12).
 
@@ -63,17 +57,13 @@ class SandwichBarrier(nn.Module):
     Args:
         latent_dim: size p of the latent.
         hidden: widths of the hidden layers, at least one.
-        lipschitz_bound: L.
-
-    Raises:
-        ConfigError: if a size or the bound is not positive.
+        lipschitz_bound: L; ``ConfigError`` if this or a size is not positive.
 
     Source: Wang & Manchester 2023, Theorem 3.2; in place of the penalty of paper eq. (9).
 
     Example:
         >>> _ = torch.manual_seed(0)
-        >>> barrier = SandwichBarrier(3, (16, 16), lipschitz_bound=2.0)
-        >>> z = torch.randn(100, 3)
+        >>> barrier, z = SandwichBarrier(3, (16, 16), lipschitz_bound=2.0), torch.randn(100, 3)
         >>> torch.allclose(barrier(z), barrier.collapse()(z), atol=1e-5)
         True
     """
@@ -136,7 +126,7 @@ class SandwichBarrier(nn.Module):
     def collapse(self) -> nn.Sequential:
         """The same function as a plain network of linear layers and ReLU; weights computed in float64, then rounded.
 
-        What the weights lose by rounding is below the slack of the certificate however large the parameters are.
+        What is lost by rounding is below the slack of the certificate however large the parameters are.
         """
         layers: list[nn.Module] = []
         for weight, bias in zip(self.weights(torch.float64), self.bias, strict=True):
