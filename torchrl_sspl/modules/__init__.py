@@ -3,13 +3,7 @@
 from __future__ import annotations
 
 from torchrl_sspl.modules.moments import MomentEncoder
-from torchrl_sspl.modules.networks import (
-    FrameEncoder,
-    InverseDynamics,
-    LatentDynamics,
-    Policy,
-    inward_clamp,
-)
+from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
 
 __all__ = [

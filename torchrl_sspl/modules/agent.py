@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import copy
-import importlib
 import inspect
 import json
-import operator
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -18,11 +15,12 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
+from torchrl_sspl.configs.reader import resolve
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.lipschitz import prove_lipschitz
 from torchrl_sspl.modules.moments import MomentEncoder
-from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
+from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
 
 WEIGHTS_FILE = "agent.safetensors"
 DESCRIPTION_FILE = "agent.json"
@@ -30,26 +28,13 @@ FORMAT_VERSION = 1
 
 
 def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
-    """Plain ReLU network ``(*batch, latent_dim) -> (*batch, 1)``: the form in which a barrier is deployed.
-
-    Args:
-        latent_dim: size of the latent.
-        hidden: widths of the hidden layers.
-
-    Returns:
-        Linear and ReLU layers in turn.
-
-    Source: none.
+    """Plain ReLU network ``(*batch, latent_dim) -> (*batch, 1)``: what is deployed of a barrier. Source: none.
 
     Example:
         >>> mlp_barrier(3, [8])(torch.zeros(5, 3)).shape
         torch.Size([5, 1])
     """
-    sizes = [latent_dim, *hidden]
-    layers: list[nn.Module] = []
-    for n_in, n_out in zip(sizes[:-1], sizes[1:], strict=True):
-        layers += [nn.Linear(n_in, n_out), nn.ReLU()]
-    return nn.Sequential(*layers, nn.Linear(sizes[-1], 1))
+    return mlp((latent_dim, *hidden, 1))
 
 
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
@@ -62,7 +47,7 @@ class Agent(nn.Module):
     r"""A frozen safe agent: :math:`z = E(o)`, :math:`B(z)`, :math:`u = \pi(z)`, :math:`z^+ = d(z, u)`.
 
     The networks are in evaluation mode and take no gradient. ``barrier``, ``policy`` and ``dynamics`` are
-    modules and are called as such.
+    modules and are called as such. Source: paper Section IV (the trained networks); deviation: none.
 
     Args:
         encoder: pixels ``(*batch, 6, H, W)`` uint8 -> latent ``(*batch, p)`` in [-1, 1].
@@ -72,10 +57,7 @@ class Agent(nn.Module):
         lipschitz_bound: the proved Lipschitz constant of ``barrier`` with respect to the Euclidean norm.
         description: how to build the networks again, and whatever else should travel with the agent.
 
-    Source: paper Section IV (the trained networks); deviation: none.
-
     Example:
-        >>> from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
         >>> agent = Agent(FrameEncoder(2, 32), LatentDynamics(2, 1), mlp_barrier(2, [8]), Policy(2, 1), 2.0)
         >>> latent = agent.encode(torch.zeros(4, 6, 32, 32, dtype=torch.uint8))
         >>> agent.barrier(latent).shape, agent.dynamics(latent, agent.policy(latent)).shape
@@ -92,10 +74,7 @@ class Agent(nn.Module):
         description: dict[str, Any] | None = None,
     ) -> None:
         super().__init__()
-        self.encoder = encoder
-        self.dynamics = dynamics
-        self.barrier = barrier
-        self.policy = policy
+        self.encoder, self.dynamics, self.barrier, self.policy = encoder, dynamics, barrier, policy
         self.lipschitz_bound = float(lipschitz_bound)
         self.description: dict[str, Any] = dict(description or {})
         self.eval()
@@ -112,16 +91,13 @@ class Agent(nn.Module):
         level: float = 0.0,
         description: dict[str, Any] | None = None,
     ) -> Agent:
-        """A frozen copy of networks in training, the barrier collapsed to a plain network, its bound proved.
+        """A frozen copy, on the CPU, of networks in training; the barrier collapsed to a plain one, its bound proved.
 
         Args:
             encoder, dynamics, policy: networks, which stay as they are; TensorDictModules are unwrapped.
             barrier: a Lipschitz barrier of this library.
             level: {B <= level} becomes {B <= 0}.
             description: whatever should travel with the agent.
-
-        Returns:
-            The agent, on the CPU; it can be saved.
 
         Source: none.
 
@@ -138,10 +114,10 @@ class Agent(nn.Module):
         witness = [m.tolist() for m in nets[2].multipliers()]  # type: ignore[operator]
         proof = prove_lipschitz(deployed, bound, multipliers=[torch.tensor(m) for m in witness])
         hidden = [layer.out_features for layer in deployed if isinstance(layer, nn.Linear)][:-1]
+        latent_dim = int(nets[1].latent_dim)  # type: ignore[arg-type]
         named = {"encoder": nets[0], "dynamics": nets[1], "policy": nets[3]}
-        networks = {k: _describe(net, int(nets[1].latent_dim)) for k, net in named.items()}  # type: ignore[arg-type]
-        body = dict(description or {})
-        body["networks"] = {**networks, "barrier": {"latent_dim": int(nets[1].latent_dim), "hidden": hidden}}  # type: ignore[arg-type]
+        networks: dict[str, Any] = {k: _describe(net, latent_dim) for k, net in named.items()}
+        body = {**(description or {}), "networks": networks | {"barrier": {"latent_dim": latent_dim, "hidden": hidden}}}
         body["lipschitz"] = {"proved": proof.proved, "reason": proof.reason, "multipliers": witness}
         return cls(nets[0], nets[1], deployed, nets[3], bound, body)
 
@@ -153,26 +129,12 @@ class Agent(nn.Module):
 
     @torch.no_grad()
     def encode(self, pixels: Tensor) -> Tensor:
-        """Latent of a stack of two frames.
-
-        Args:
-            pixels: ``(*batch, 6, H, W)`` uint8, frame t-1 (RGB) then frame t (RGB).
-
-        Returns:
-            ``(*batch, p)`` in [-1, 1].
-        """
+        """Latent ``(*batch, p)`` in [-1, 1] of pixels ``(*batch, 6, H, W)`` uint8: RGB of frames t-1 and t."""
         return self.encoder(pixels)
 
     @torch.no_grad()
     def act(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Action and barrier value for a stack of two frames.
-
-        Args:
-            pixels: ``(*batch, 6, H, W)`` uint8.
-
-        Returns:
-            action ``(*batch, m)`` in physical units, barrier ``(*batch, 1)``.
-        """
+        """Action ``(*batch, m)`` in physical units and barrier value ``(*batch, 1)``; pixels as for :meth:`encode`."""
         latent = self.encode(pixels)
         return self.policy(latent), self.barrier(latent)
 
@@ -182,21 +144,15 @@ class Agent(nn.Module):
         return int(self.barrier[0].in_features)  # type: ignore[index, union-attr]
 
     def save(self, path: str | Path) -> Path:
-        """Write ``agent.safetensors`` and ``agent.json`` into a directory.
-
-        Args:
-            path: the directory, created if necessary.
-
-        Returns:
-            The directory.
+        """Write ``agent.safetensors`` and ``agent.json`` into a directory, which is created if necessary and returned.
 
         Raises:
             ConfigError: if the agent has no description of its networks.
         """
         if "networks" not in self.description:
             raise ConfigError(
-                "expected description['networks'] (class names and arguments of encoder, dynamics, barrier and policy), "
-                "received none; build the agent with a description to save it"
+                "expected description['networks'] (class names and arguments of encoder, dynamics, barrier and policy),"
+                " received none; build the agent with a description to save it"
             )
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
@@ -207,14 +163,7 @@ class Agent(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path, device: torch.device | str = "cpu") -> Agent:
-        """Read an agent from a directory that :meth:`save` has written.
-
-        Args:
-            path: the directory.
-            device: where the networks go.
-
-        Returns:
-            The agent, frozen, in evaluation mode.
+        """Read an agent from a directory that :meth:`save` has written, to a device.
 
         Raises:
             CheckpointError: if a file is missing, unreadable, of another format, or does not fit the networks.
@@ -234,23 +183,18 @@ class Agent(nn.Module):
                     f"expected agent format {FORMAT_VERSION} in '{path}'; the agent was written by another version of "
                     "the library, train it again or load it with that version"
                 )
-            bound = float(body.pop("lipschitz_bound"))
-            nets = body["networks"]
+            bound, nets = float(body.pop("lipschitz_bound")), body["networks"]
+            encoder, dynamics = _build(ENCODERS, nets["encoder"]), _build(DYNAMICS, nets["dynamics"])
             agent = cls(
-                _build(ENCODERS, nets["encoder"]),
-                _build(DYNAMICS, nets["dynamics"]),
-                mlp_barrier(**nets["barrier"]),
-                _build(POLICIES, nets["policy"]),
-                bound,
-                body,
+                encoder, dynamics, mlp_barrier(**nets["barrier"]), _build(POLICIES, nets["policy"]), bound, body
             )
             agent.load_state_dict(load_file(path / WEIGHTS_FILE))
         except CheckpointError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError, SafetensorError) as error:
             raise CheckpointError(
-                f"expected a readable agent in '{path}', received {type(error).__name__}: {str(error)[:200]}; restore the "
-                "files or train again"
+                f"expected a readable agent in '{path}', received {type(error).__name__}: {str(error)[:200]}; restore "
+                "the files or train again"
             ) from error
         for name, value in agent.state_dict().items():
             if not torch.isfinite(value).all():
@@ -278,10 +222,10 @@ class _Elsewhere(nn.Module):
 
 
 def hosted(agent: Agent) -> Agent:
-    """The agent for measurements, which draw states and count in host memory.
+    """The agent for measurements, which draw states and count in host memory; itself if it is there already.
 
     The encoder, in which the time goes, stays on its device and takes and gives tensors of the host; the small networks
-    are copied to the host. An agent that is there already is returned as it is.
+    are copied to the host.
     """
     device = next(agent.barrier.parameters()).device
     if device.type == "cpu":
@@ -291,19 +235,14 @@ def hosted(agent: Agent) -> Agent:
 
 
 def build_encoder(name: str, **sizes: Any) -> nn.Module:
-    """An encoder of the library by name, or one of your own by import path.
+    """An encoder of the library by name, or one of your own by import path. Source: none.
 
     Args:
         name: key of :data:`ENCODERS`, or ``"package.module:Class"``.
         **sizes: those that the class takes are handed on: ``latent_dim``, ``image_size``, ``pool_to``, ...
 
-    Returns:
-        The encoder.
-
     Raises:
         ConfigError: if there is no such encoder, or it needs something else.
-
-    Source: none.
 
     Example:
         >>> build_encoder("FrameEncoder", latent_dim=3, pool_to=16).latent_dim
@@ -312,19 +251,19 @@ def build_encoder(name: str, **sizes: Any) -> nn.Module:
     try:
         kind = ENCODERS.get(name) or resolve(name)
     except ConfigError as error:
-        raise ConfigError(f"expected network.encoder to be one of {sorted(ENCODERS)} or package.module:Class, {error}") from error
+        raise ConfigError(
+            f"expected network.encoder to be one of {sorted(ENCODERS)} or package.module:Class, {error}"
+        ) from error
     return call_with(kind, sizes)
 
 
 def call_with(kind: Any, sizes: dict[str, Any]) -> nn.Module:
-    """A class or function called with those of the sizes that it takes.
-
-    Raises:
-        ConfigError: if it is a module already, or needs something else.
-    """
+    """A class or function called with those of the sizes that it takes; a ConfigError if it needs something else."""
     if isinstance(kind, nn.Module) or not callable(kind):
-        found = f"a module; give its class, {type(kind).__name__}" if isinstance(kind, nn.Module) else f"a {type(kind).__name__}"
-        raise ConfigError(f"encoder: expected a class or a function latent_dim -> module, received {found}")
+        found = "a module; give its class," if isinstance(kind, nn.Module) else "a"
+        raise ConfigError(
+            f"encoder: expected a class or a function latent_dim -> module, received {found} {type(kind).__name__}"
+        )
     taken = inspect.signature(kind).parameters
     if any(p.kind is p.VAR_KEYWORD for p in taken.values()) and "latent_dim" in taken:
         chosen = sizes
@@ -341,39 +280,6 @@ def call_with(kind: Any, sizes: dict[str, Any]) -> nn.Module:
     if not getattr(made, "arguments", None):
         made.arguments = chosen or {"latent_dim": sizes["latent_dim"]}  # with which it is built again
     return made
-
-
-def resolve(path: str) -> Any:
-    """What an import path names.
-
-    Args:
-        path: ``"package.module:name"`` or ``"package.module.name"``; the working directory is searched too.
-
-    Returns:
-        The object.
-
-    Raises:
-        ConfigError: if there is no such module, or no such name in it.
-
-    Source: none.
-
-    Example:
-        >>> resolve("torchrl_sspl.sets:SAFE")
-        1
-    """
-    module, sign, name = path.partition(":")
-    if not sign:
-        module, _, name = path.rpartition(".")
-    sys.path.append(os.getcwd())
-    try:
-        return operator.attrgetter(name)(importlib.import_module(module))
-    except (ImportError, ValueError, AttributeError) as error:
-        raise ConfigError(
-            f"expected an import path like package.module:name, received '{path}' ({type(error).__name__}: {error}); "
-            "run from the folder that holds the module, or install it"
-        ) from error
-    finally:
-        sys.path.remove(os.getcwd())
 
 
 def _describe(network: nn.Module, latent_dim: int) -> dict[str, Any]:
@@ -400,37 +306,14 @@ def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any]) -> nn.Mod
 
 
 def load(name_or_path: str | Path, device: torch.device | str = "cpu") -> Agent:
-    """Load a shipped agent by name, or an agent from a run directory.
-
-    Args:
-        name_or_path: ``"pendulum"``, or a directory with an agent (or with an ``agent/`` folder) in it.
-        device: where the networks go.
-
-    Returns:
-        The agent, frozen, in evaluation mode.
-
-    Raises:
-        CheckpointError: if there is no such agent, or it cannot be read.
-        ConfigError: if this machine has no such device.
-
-    Source: none.
-    """
+    """The shipped agent of a name (``"pendulum"``), or that of a run directory; errors as for :meth:`Agent.load`."""
     return Agent.load(agent_directory(name_or_path), device)
 
 
 def agent_directory(name_or_path: str | Path) -> Path:
-    """Directory in which an agent's files lie.
+    """Directory in which the files of an agent lie: of a shipped one by name, or below a directory.
 
-    Args:
-        name_or_path: name of a shipped agent or a directory, as for :func:`load`.
-
-    Returns:
-        The directory with ``agent.json``.
-
-    Raises:
-        CheckpointError: if there is none, or a shipped agent and a folder here have the same name.
-
-    Source: none.
+    If there is none, or a shipped agent and a folder here have the same name, it is a CheckpointError. Source: none.
     """
     shipped = Path(__file__).resolve().parent.parent / "agents"
     candidates = [Path(name_or_path), Path(name_or_path) / "agent"]
@@ -439,8 +322,8 @@ def agent_directory(name_or_path: str | Path) -> Path:
         named = shipped / name_or_path
         if (named / DESCRIPTION_FILE).is_file() and found and not found[0].samefile(named):
             raise CheckpointError(
-                f"'{name_or_path}' is a shipped agent and a folder here: give ./{name_or_path} for the folder, or start "
-                "elsewhere"
+                f"'{name_or_path}' is a shipped agent and a folder here: give ./{name_or_path} for the folder, or "
+                "start elsewhere"
             )
         found += [named] if (named / DESCRIPTION_FILE).is_file() else []
     if found:

@@ -19,13 +19,12 @@ class ColourMoments(nn.Module):
     The background b is the median of frames from different moments; the whitening (:math:`\mu`, and the leading
     eigenvectors V and eigenvalues of the covariance of c) makes the small distance between the centres of two colours,
     which tells the heading, as large as the place. All of it comes from frames alone and is set by :meth:`fit`.
+    Source: none (the paper does not give an architecture).
 
     Args:
         size: height and width of the (pooled) frames.
         channels: colours.
         kept: number of leading components kept, at most ``2 * channels``.
-
-    Source: none (the paper does not give an architecture).
 
     Example:
         >>> frames = torch.ones(50, 3, 16, 16)
@@ -59,11 +58,7 @@ class ColourMoments(nn.Module):
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
-        """Take background and whitening from frames ``(n, c, H, W)``.
-
-        Raises:
-            EmptyRegionError: fewer than ten frames.
-        """
+        """Take background and whitening from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         if len(frames) < 10:
             raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
         self.background.copy_(frames[:2000].median(0).values)
@@ -88,7 +83,8 @@ class MomentEncoder(FrameEncoder):
 
     with h the whitened centres of :class:`ColourMoments`. Averages over the frame tell places to a fraction of a pixel
     and the heading of a robot whose ends differ in colour, at every place alike; the MLP shapes the latent. Before the
-    training :meth:`fit` takes the statistics from frames; no label and no state enters.
+    training :meth:`fit` takes the statistics from frames; no label and no state enters. Sizes that are not positive
+    integers are a ConfigError. Source: paper eq. (7); the paper does not give an architecture.
 
     Args:
         latent_dim: size p of the latent, at most six.
@@ -97,14 +93,8 @@ class MomentEncoder(FrameEncoder):
         hidden: width of the MLP.
         velocity_gain: gain k of the difference of the two frames' centres; 0 where one frame shows all.
 
-    Raises:
-        ConfigError: if a size is not a positive integer.
-
-    Source: paper eq. (7); the paper does not give an architecture.
-
     Example:
-        >>> encoder = MomentEncoder(latent_dim=4, image_size=128)
-        >>> encoder(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
+        >>> MomentEncoder(latent_dim=4, image_size=128)(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
         torch.Size([2, 4])
     """
 
@@ -144,6 +134,3 @@ class MomentEncoder(FrameEncoder):
         motion = self.velocity_gain * (current - previous)
         shaped = self.latent_head(torch.cat([current, motion], -1))
         return torch.tanh(self.gain * current + shaped)
-
-
-__all__ = ["ColourMoments", "MomentEncoder"]

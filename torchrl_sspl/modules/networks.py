@@ -39,7 +39,7 @@ class _InwardClamp(torch.autograd.Function):
 
 
 def inward_clamp(value: Tensor) -> Tensor:
-    r"""Clamps to :math:`[-1, 1]`, with a gradient that can always lead back inside.
+    r"""Clamps to :math:`[-1, 1]`, any shape and floating dtype, with a gradient that can always lead back inside.
 
     .. math:: c(v) = \min(1, \max(-1, v)), \qquad
         \frac{\partial \ell}{\partial v} = \begin{cases} 0 & v > 1, \partial \ell / \partial c < 0 \\
@@ -47,15 +47,7 @@ def inward_clamp(value: Tensor) -> Tensor:
 
     The value is the exact clamp. The gradient is the straight-through one, except that a step which would
     move further out is dropped. An ordinary clamp (or a saturated tanh) keeps a network that has left the
-    interval stuck outside for good; the unrestricted straight-through gradient drives it further out.
-
-    Args:
-        value: any shape, floating point.
-
-    Returns:
-        The clamped tensor, same shape and dtype.
-
-    Source: none.
+    interval stuck outside for good; the unrestricted straight-through gradient drives it further out. Source: none.
 
     Example:
         >>> value = torch.tensor([2.0, 2.0], requires_grad=True)
@@ -66,7 +58,8 @@ def inward_clamp(value: Tensor) -> Tensor:
     return _InwardClamp.apply(value)
 
 
-def _mlp(sizes: Sequence[int], activation: type[nn.Module] = nn.ReLU) -> nn.Sequential:
+def mlp(sizes: Sequence[int], activation: type[nn.Module] = nn.ReLU) -> nn.Sequential:
+    """Linear layers with an activation between them."""
     layers: list[nn.Module] = []
     for inputs, outputs in pairwise(sizes):
         layers += [nn.Linear(inputs, outputs), activation()]
@@ -118,6 +111,8 @@ class FrameEncoder(nn.Module):
     for a transition), and the difference of smooth features carries the velocity. Frames are pooled to about
     32 x 32 first, which makes the weights independent of the size of the picture. Normalisation is by layer;
     there is no running statistic, so a target network that follows the parameters misses nothing.
+    Source: paper eq. (7), :math:`z_i = E_\theta(\mathcal{O}_i)`; the paper does not give an architecture, and its
+    latent is unbounded.
 
     Args:
         latent_dim: size p of the latent.
@@ -131,9 +126,8 @@ class FrameEncoder(nn.Module):
 
     Raises:
         ConfigError: if a size is not a positive integer.
-
-    Source: paper eq. (7), :math:`z_i = E_\theta(\mathcal{O}_i)`; the paper does not give an architecture, and
-    its latent is unbounded.
+        DTypeError: when called, if frames are not uint8.
+        ShapeError: when called, if channels or size do not fit.
 
     Example:
         >>> encoder = FrameEncoder(latent_dim=2, image_size=64)
@@ -175,14 +169,9 @@ class FrameEncoder(nn.Module):
             height, width, previous = (height + 1) // 2, (width + 1) // 2, size
         flat = height * width * previous
         self.trunk = nn.Sequential(
-            *layers,
-            nn.Flatten(),
-            nn.LayerNorm(flat),
-            nn.Linear(flat, hidden),
-            nn.SiLU(),
-            nn.Linear(hidden, features),
+            *layers, nn.Flatten(), nn.LayerNorm(flat), nn.Linear(flat, hidden), nn.SiLU(), nn.Linear(hidden, features)
         )
-        self.latent_head = _mlp((2 * features, hidden, latent_dim), nn.SiLU)
+        self.latent_head = mlp((2 * features, hidden, latent_dim), nn.SiLU)
 
     def _check(self, frames: Tensor, channels: int, name: str) -> None:
         height, width = self.image_size or ("H", "W")
@@ -200,24 +189,7 @@ class FrameEncoder(nn.Module):
             )
 
     def frames(self, frames: Tensor) -> Tensor:
-        """Encodes single frames.
-
-        Args:
-            frames: ``(*batch, 3, H, W)`` uint8.
-
-        Returns:
-            ``(*batch, features)`` float.
-
-        Raises:
-            DTypeError: if the frames are not uint8.
-            ShapeError: if channels or size do not fit.
-
-        Source: none.
-
-        Example:
-            >>> FrameEncoder(2).frames(torch.zeros(4, 3, 48, 48, dtype=torch.uint8)).shape
-            torch.Size([4, 16])
-        """
+        """Features ``(*batch, features)`` of single frames ``(*batch, 3, H, W)`` uint8."""
         self._check(frames, self.in_channels, "frames")
         batch = frames.shape[:-3]
         # Not next(self.parameters()): a delayed copy of the weights has none.
@@ -240,7 +212,7 @@ class FrameEncoder(nn.Module):
         return frames if kernel == (1, 1) else F.avg_pool2d(frames, kernel)
 
     def _pool_bytes(self, frames: Tensor, dtype: torch.dtype) -> Tensor:
-        """The same average of uint8 frames, summed in integers: several times faster, and exact as the average itself is."""
+        """The same average of uint8 frames, summed in integers: several times faster, and as exact."""
         (n, c, height, width), (rows, columns) = frames.shape, self.pool_to
         k, m = height // rows, width // columns
         if height % rows or width % columns or k > 128 or k * m == 1:  # 128 rows of 255 are the most that 16 bits hold
@@ -256,48 +228,14 @@ class FrameEncoder(nn.Module):
         return total / (k * m)
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
-        """Latent from the features of two successive frames.
-
-        Args:
-            previous: ``(*batch, features)`` of frame t-1.
-            current: ``(*batch, features)`` of frame t.
-
-        Returns:
-            ``(*batch, p)`` latent in ``[-1, 1]``.
-
-        Raises:
-            ShapeError: if the number of features does not fit.
-
-        Source: none.
-
-        Example:
-            >>> FrameEncoder(2).head(torch.zeros(4, 16), torch.zeros(4, 16)).shape
-            torch.Size([4, 2])
-        """
+        """Latent ``(*batch, p)`` in ``[-1, 1]`` from the features ``(*batch, features)`` of two successive frames."""
         _check_last(previous, self.features, "previous")
         _check_last(current, self.features, "current")
         motion = self.velocity_gain * (current - previous)
         return torch.tanh(self.latent_head(torch.cat([current, motion], -1)))
 
     def sequence(self, frames: Tensor) -> Tensor:
-        """Latents along a sequence of frames, each frame encoded once.
-
-        Args:
-            frames: ``(*batch, T, 3, H, W)`` uint8, ``T >= 2``.
-
-        Returns:
-            ``(*batch, T - 1, p)`` latents; entry k belongs to frames k and k + 1.
-
-        Raises:
-            DTypeError: if the frames are not uint8.
-            ShapeError: if there are fewer than two frames, or channels or size do not fit.
-
-        Source: none.
-
-        Example:
-            >>> FrameEncoder(2).sequence(torch.zeros(4, 3, 3, 48, 48, dtype=torch.uint8)).shape
-            torch.Size([4, 2, 2])
-        """
+        """Latents ``(*batch, T - 1, p)`` of frames ``(*batch, T, 3, H, W)`` uint8, entry k of frames k and k + 1."""
         if frames.ndim < 4 or frames.shape[-4] < 2:
             raise ShapeError(
                 f"expected frames of shape (*batch, T, {self.in_channels}, H, W) with T >= 2, received "
@@ -307,55 +245,18 @@ class FrameEncoder(nn.Module):
         return self.head(features[..., :-1, :], features[..., 1:, :])
 
     def forward(self, pixels: Tensor) -> Tensor:
-        """Latent of a stack of two frames.
-
-        Args:
-            pixels: ``(*batch, 6, H, W)`` uint8, frame t-1 then frame t.
-
-        Returns:
-            ``(*batch, p)`` latent in ``[-1, 1]``.
-
-        Raises:
-            DTypeError: if the pixels are not uint8.
-            ShapeError: if channels or size do not fit.
-
-        Source: paper eq. (7).
-
-        Example:
-            >>> FrameEncoder(3)(torch.zeros(6, 40, 40, dtype=torch.uint8)).shape
-            torch.Size([3])
-        """
+        """Latent ``(*batch, p)`` in ``[-1, 1]`` of pixels ``(*batch, 6, H, W)`` uint8, frame t-1 then frame t."""
         self._check(pixels, 2 * self.in_channels, "pixels")
         stacked = pixels.reshape(*pixels.shape[:-3], 2, self.in_channels, *pixels.shape[-2:])
         return self.sequence(stacked).squeeze(-2)
 
 
-@known_form("residual")
-class LatentDynamics(nn.Module):
-    r"""Predicts the next latent from latent and action, on the bounded domain.
-
-    .. math:: d(z, u) = \operatorname{clamp}(z + \operatorname{net}(z, u / u_{\max}), -1, 1)
-
-    The residual form makes "nothing moves" the easy guess. See :func:`inward_clamp` for the gradient.
-
-    Args:
-        latent_dim: size p of the latent.
-        action_dim: size of the action.
-        hidden: widths of the hidden layers (ReLU).
-        action_scale: physical units per unit of normalised action, a number or one per dimension.
-
-    Raises:
-        ConfigError: if a size or the scale is not valid.
-
-    Source: paper eq. (8), third term; the paper does not give an architecture.
-
-    Example:
-        >>> dynamics = LatentDynamics(latent_dim=2, action_dim=1, action_scale=10.0)
-        >>> dynamics(torch.zeros(5, 2), torch.ones(5, 1)).shape
-        torch.Size([5, 2])
-    """
+class _OfLatents(nn.Module):
+    """A network of latents and actions: sizes of what it reads and gives, the layers between, and the scale."""
 
     action_scale: Tensor
+    _reads: tuple[str, ...]
+    _gives: str
 
     def __init__(
         self,
@@ -369,51 +270,50 @@ class LatentDynamics(nn.Module):
         self.action_dim = _positive(action_dim, "action_dim")
         # A constant, not a statistic: nothing that a target network would have to follow.
         self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
-        self.net = _mlp((latent_dim + action_dim, *hidden, latent_dim))
+        self.net = mlp((sum(getattr(self, size) for size in self._reads), *hidden, getattr(self, self._gives)))
         sizes = {"latent_dim": latent_dim, "action_dim": action_dim, "hidden": list(hidden)}
         self.arguments: dict[str, Any] = {**sizes, "action_scale": self.action_scale.flatten().tolist()}
 
+
+@known_form("residual")
+class LatentDynamics(_OfLatents):
+    r"""Predicts the next latent from latent and action, on the bounded domain.
+
+    .. math:: d(z, u) = \operatorname{clamp}(z + \operatorname{net}(z, u / u_{\max}), -1, 1)
+
+    The residual form makes "nothing moves" the easy guess. See :func:`inward_clamp` for the gradient.
+    Source: paper eq. (8), third term; the paper does not give an architecture.
+
+    Args:
+        latent_dim, action_dim: sizes of latent and action.
+        hidden: widths of the hidden layers (ReLU).
+        action_scale: physical units per unit of normalised action, a number or one per dimension.
+
+    Raises:
+        ConfigError: if a size or the scale is not valid.
+        ShapeError: when called, if a last dimension does not fit; as for the other networks of latents.
+
+    Example:
+        >>> LatentDynamics(latent_dim=2, action_dim=1, action_scale=10.0)(torch.zeros(5, 2), torch.ones(5, 1)).shape
+        torch.Size([5, 2])
+    """
+
+    _reads, _gives = ("latent_dim", "action_dim"), "latent_dim"
+
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
-        """Next latent.
-
-        Args:
-            latent: ``(*batch, p)``.
-            action: ``(*batch, action_dim)`` in physical units.
-
-        Returns:
-            ``(*batch, p)`` in ``[-1, 1]``.
-
-        Raises:
-            ShapeError: if the last dimension of either does not fit.
-
-        Source: paper eq. (8), third term.
-
-        Example:
-            >>> LatentDynamics(2, 1)(torch.zeros(5, 2), torch.zeros(5, 1)).abs().max() <= 1
-            tensor(True)
-        """
+        """Next latent in ``[-1, 1]`` of latents ``(*batch, p)``, actions ``(*batch, action_dim)`` in physical units."""
         _check_last(latent, self.latent_dim, "latent")
         _check_last(action, self.action_dim, "action")
         return inward_clamp(latent + self.net(torch.cat([latent, action / self.action_scale], -1)))
 
 
 @known_form("bounded")
-class Policy(nn.Module):
-    r"""Deterministic bounded policy on latents.
+class Policy(_OfLatents):
+    r"""Deterministic bounded policy on latents; arguments and errors as for :class:`LatentDynamics`.
 
     .. math:: \pi(z) = u_{\max} \operatorname{clamp}(\operatorname{net}(z), -1, 1)
 
     See :func:`inward_clamp` for the gradient, which does not get stuck at the limits of the action.
-
-    Args:
-        latent_dim: size p of the latent.
-        action_dim: size of the action.
-        hidden: widths of the hidden layers (ReLU).
-        action_scale: largest action in physical units, a number or one per dimension.
-
-    Raises:
-        ConfigError: if a size or the scale is not valid.
-
     Source: paper section III-C, :math:`\pi_\theta(z_i)`; the paper does not give an architecture.
 
     Example:
@@ -422,7 +322,7 @@ class Policy(nn.Module):
         True
     """
 
-    action_scale: Tensor
+    _reads, _gives = ("latent_dim",), "action_dim"
 
     def __init__(
         self,
@@ -431,93 +331,31 @@ class Policy(nn.Module):
         hidden: Sequence[int] = (32, 32),
         action_scale: float | Sequence[float] | Tensor = 1.0,
     ) -> None:
-        super().__init__()
-        self.latent_dim = _positive(latent_dim, "latent_dim")
-        self.action_dim = _positive(action_dim, "action_dim")
-        self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
-        self.net = _mlp((latent_dim, *hidden, action_dim))
-        sizes = {"latent_dim": latent_dim, "action_dim": action_dim, "hidden": list(hidden)}
-        self.arguments: dict[str, Any] = {**sizes, "action_scale": self.action_scale.flatten().tolist()}
+        super().__init__(latent_dim, action_dim, hidden, action_scale)
 
     def forward(self, latent: Tensor) -> Tensor:
-        """Action.
-
-        Args:
-            latent: ``(*batch, p)``.
-
-        Returns:
-            ``(*batch, action_dim)`` in physical units.
-
-        Raises:
-            ShapeError: if the last dimension does not fit.
-
-        Source: paper section III-C.
-
-        Example:
-            >>> Policy(2, 1)(torch.zeros(5, 2)).shape
-            torch.Size([5, 1])
-        """
+        """Action ``(*batch, action_dim)`` in physical units of a latent ``(*batch, p)``."""
         _check_last(latent, self.latent_dim, "latent")
         return self.action_scale * inward_clamp(self.net(latent))
 
 
-class InverseDynamics(nn.Module):
+class InverseDynamics(_OfLatents):
     r"""Reads the action from two successive latents; a training aid that is not deployed.
 
     .. math:: \hat u = u_{\max} \operatorname{net}(z_t, z_{t+1})
 
-    A latent from which the action can be read has to keep what the action changes (here: velocities).
-
-    Args:
-        latent_dim: size p of the latent.
-        action_dim: size of the action.
-        hidden: widths of the hidden layers (ReLU).
-        action_scale: physical units per unit of normalised action, a number or one per dimension.
-
-    Raises:
-        ConfigError: if a size or the scale is not valid.
-
-    Source: none (the paper has no such term).
+    A latent from which the action can be read has to keep what the action changes (here: velocities). Arguments and
+    errors as for :class:`LatentDynamics`. Source: none (the paper has no such term).
 
     Example:
         >>> InverseDynamics(2, 1)(torch.zeros(5, 2), torch.zeros(5, 2)).shape
         torch.Size([5, 1])
     """
 
-    action_scale: Tensor
-
-    def __init__(
-        self,
-        latent_dim: int,
-        action_dim: int,
-        hidden: Sequence[int] = (64, 64),
-        action_scale: float | Sequence[float] | Tensor = 1.0,
-    ) -> None:
-        super().__init__()
-        self.latent_dim = _positive(latent_dim, "latent_dim")
-        self.action_dim = _positive(action_dim, "action_dim")
-        self.register_buffer("action_scale", _action_scale(action_scale, action_dim))
-        self.net = _mlp((2 * latent_dim, *hidden, action_dim))
+    _reads, _gives = ("latent_dim", "latent_dim"), "action_dim"
 
     def forward(self, latent: Tensor, next_latent: Tensor) -> Tensor:
-        """Estimated action.
-
-        Args:
-            latent: ``(*batch, p)``.
-            next_latent: ``(*batch, p)``.
-
-        Returns:
-            ``(*batch, action_dim)`` in physical units.
-
-        Raises:
-            ShapeError: if the last dimension of either does not fit.
-
-        Source: none.
-
-        Example:
-            >>> InverseDynamics(2, 1)(torch.zeros(5, 2), torch.zeros(5, 2)).shape
-            torch.Size([5, 1])
-        """
+        """Estimated action ``(*batch, action_dim)``, in physical units, between two latents ``(*batch, p)``."""
         _check_last(latent, self.latent_dim, "latent")
         _check_last(next_latent, self.latent_dim, "next_latent")
         return self.action_scale * self.net(torch.cat([latent, next_latent], -1))

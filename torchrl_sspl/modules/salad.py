@@ -16,20 +16,14 @@ from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics
 def as_tensordict_module(
     module: nn.Module, in_keys: Sequence[NestedKey], out_keys: Sequence[NestedKey]
 ) -> TensorDictModuleBase:
-    """Gives a plain network its keys; a TensorDict module keeps its own.
+    """Gives a plain network its keys; a TensorDict module keeps its own. Source: none.
 
     Args:
         module: a network on tensors, or a TensorDict module.
-        in_keys: keys that a plain network reads.
-        out_keys: keys that it writes.
-
-    Returns:
-        A TensorDict module.
+        in_keys, out_keys: keys that a plain network reads and writes.
 
     Raises:
         ConfigError: if ``module`` is not a module, or is a TensorDict module with another number of keys.
-
-    Source: none.
 
     Example:
         >>> as_tensordict_module(nn.Linear(2, 1), ["latent"], ["barrier"]).out_keys
@@ -57,25 +51,19 @@ class SaLaD(TensorDictSequential):
 
     Any of the three can be a plain network or a TensorDict module; plain ones get the keys ``"pixels"``,
     ``"action"``, ``"latent"``, ``("next", "latent")`` and ``"barrier"``. The safe side is :math:`B \le 0`.
+    What is no module is a ConfigError. Source: paper section III-A.
 
     Args:
         encoder: observation -> latent ``(*batch, p)``.
         dynamics: (latent, action) -> next latent ``(*batch, p)``.
         barrier: latent -> barrier value ``(*batch, 1)``.
 
-    Raises:
-        ConfigError: if one of them is not a module.
-
-    Source: paper section III-A.
-
     Example:
         >>> import torch
         >>> from tensordict import TensorDict
-        >>> salad = SaLaD(FrameEncoder(2), LatentDynamics(2, 1), nn.Linear(2, 1))
-        >>> pixels = torch.zeros(4, 6, 32, 32, dtype=torch.uint8)
-        >>> data = TensorDict(pixels=pixels, action=torch.zeros(4, 1), batch_size=4)
-        >>> salad(data)["next", "latent"].shape
-        torch.Size([4, 2])
+        >>> data = TensorDict(pixels=torch.zeros(6, 32, 32, dtype=torch.uint8), action=torch.zeros(1))
+        >>> SaLaD(FrameEncoder(2), LatentDynamics(2, 1), nn.Linear(2, 1))(data)["next", "latent"].shape
+        torch.Size([2])
     """
 
     def __init__(self, encoder: nn.Module, dynamics: nn.Module, barrier: nn.Module) -> None:
@@ -96,23 +84,14 @@ class SaLaD(TensorDictSequential):
         image_size: int | Sequence[int] | None = None,
         **encoder_options: Any,
     ) -> SaLaD:
-        """World model with the default networks: frame encoder, residual dynamics, sandwich barrier.
+        """World model with the default networks: frame encoder, residual dynamics, sandwich barrier. Source: none.
 
         Args:
-            latent_dim: size p of the latent.
-            action_dim: size of the action.
+            latent_dim, action_dim: sizes of latent and action; a ConfigError if one is not valid.
             action_scale: largest action in physical units.
             lipschitz_bound: Lipschitz bound of the barrier.
             image_size: height and width of the frames; ``None`` accepts any.
             **encoder_options: further arguments of :class:`FrameEncoder`.
-
-        Returns:
-            The world model.
-
-        Raises:
-            ConfigError: if a size is not valid.
-
-        Source: none.
 
         Example:
             >>> SaLaD.from_sizes(latent_dim=2, action_dim=1, action_scale=10.0).out_keys
@@ -143,21 +122,14 @@ class SaLaD(TensorDictSequential):
 
 
 def make_rollout_policy(encoder: nn.Module, policy: nn.Module) -> TensorDictSequential:
-    """Policy from pixels for collectors and rollouts: only the action is written.
+    """Policy from ``"pixels"`` to ``"action"`` for collectors and rollouts, sharing the parameters of both networks.
 
-    Otherwise the latent would be stored with every frame, and be stale as soon as the encoder moves.
+    Only the action is written: the latent would be stored with every frame, and be stale as soon as the encoder moves.
+    What is no module is a ConfigError. Source: none.
 
     Args:
         encoder: observation -> latent, or the :class:`SaLaD` that holds it.
         policy: latent -> action.
-
-    Returns:
-        A TensorDict module from ``"pixels"`` to ``"action"``, sharing the parameters of both.
-
-    Raises:
-        ConfigError: if one of them is not a module.
-
-    Source: none.
 
     Example:
         >>> from torchrl_sspl.modules import Policy

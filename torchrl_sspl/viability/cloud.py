@@ -26,27 +26,16 @@ def _tree(points: Tensor):
     return cKDTree(points.detach().cpu().numpy())
 
 
-def _neighbours(queries: Tensor, points: Tensor, count: int, smoothing: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Distance to the nearest point ``(n,)``, nearest points ``(n, count)``, inverse of their distances (not normalised)."""
-    distance, found = _tree(points).query(queries.detach().cpu().numpy(), k=range(1, count + 1))
-    near = torch.as_tensor(distance, dtype=torch.float32)
-    return near[:, 0], torch.as_tensor(found), 1.0 / (near + smoothing)
+def _nearest(queries: Tensor, points: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """Distances ``(n, count)`` float32 to the nearest points, and which these are."""
+    distance, index = _tree(points).query(queries.detach().cpu().numpy(), k=range(1, count + 1))
+    return torch.as_tensor(distance, dtype=torch.float32), torch.as_tensor(index)
 
 
 def nearest_distance(queries: Tensor, points: Tensor) -> Tensor:
-    """Euclidean distance of every query to the nearest of the points.
+    """Euclidean distance ``(n,)`` float32 of every query ``(n, p)`` to the nearest of points ``(m, p)``.
 
-    Args:
-        queries: ``(n, p)`` latents.
-        points: ``(m, p)`` latents, ``m >= 1``.
-
-    Returns:
-        ``(n,)`` float32.
-
-    Raises:
-        EmptyRegionError: if there are no points.
-
-    Source: none.
+    No points are an EmptyRegionError. Source: none.
 
     Example:
         >>> nearest_distance(torch.tensor([[0.0, 3.0]]), torch.tensor([[0.0, 0.0], [0.0, 1.0]]))
@@ -54,15 +43,16 @@ def nearest_distance(queries: Tensor, points: Tensor) -> Tensor:
     """
     if points.shape[0] == 0:
         raise EmptyRegionError("expected at least one point to measure distances to, received 0; collect more data")
-    return torch.as_tensor(_tree(points).query(queries.detach().cpu().numpy())[0], dtype=torch.float32)
+    return _nearest(queries, points, 1)[0][:, 0]
 
 
 def normal_projectors(points: Tensor, reference: Tensor, *, neighbours: int = 24, threshold: float = 0.05) -> Tensor:
-    r"""Projector onto the directions in which the data manifold has no extent, at every point.
+    r"""Projectors ``(n, p, p)`` onto the directions in which the data manifold has no extent, at every point.
 
     .. math:: N_i = \sum_{j: \lambda_j < \tau \lambda_{\max}} v_j v_j^\top
 
-    with eigenpairs of the covariance of the nearest neighbours (local principal components).
+    with eigenpairs of the covariance of the nearest neighbours (local principal components); zero where the data has
+    extent in every direction. Source: none.
 
     Args:
         points: ``(n, p)`` latents.
@@ -70,20 +60,12 @@ def normal_projectors(points: Tensor, reference: Tensor, *, neighbours: int = 24
         neighbours: number of neighbours per point.
         threshold: eigenvalue ratio below which a direction counts as normal.
 
-    Returns:
-        ``(n, p, p)`` projectors (zero where the data has extent in every direction).
-
-    Source: none.
-
     Example:
         >>> line = torch.stack([torch.linspace(-1, 1, 100), torch.zeros(100)], -1)
-        >>> normal_projectors(line[:1], line)
-        tensor([[[0., 0.],
-                 [0., 1.]]])
+        >>> normal_projectors(line[:1], line).tolist()
+        [[[0.0, 0.0], [0.0, 1.0]]]
     """
-    k = min(neighbours, reference.shape[0])
-    index = torch.as_tensor(_tree(reference).query(points.detach().cpu().numpy(), k=k)[1]).reshape(len(points), k)
-    local = reference[index]
+    local = reference[_nearest(points, reference, min(neighbours, len(reference)))[1]]
     local = local - local.mean(1, keepdim=True)
     values, vectors = torch.linalg.eigh(local.transpose(1, 2) @ local)
     normal = (values < threshold * values[:, -1:]).to(vectors.dtype)
@@ -94,18 +76,14 @@ def normal_projectors(points: Tensor, reference: Tensor, *, neighbours: int = 24
 class InvariantSet:
     """A robust invariant subset of a cloud of latents.
 
-    Attributes:
-        inside: ``(n,)`` bool, which candidates belong to the set.
-        clearance: ``(n, k)`` distance from the successor under each action, the worst of its errors, to the nearest
-            point outside; zero for candidates outside and for actions that leave the set.
-        removed: ``(n,)`` int64, sweep in which a candidate was removed; 0 for those inside.
-        iterations: sweeps until nothing more was removed.
+    The clearance is the distance from the successor under each action, the worst of its errors, to the nearest point
+    outside; zero for candidates outside and for actions that leave the set.
     """
 
-    inside: Tensor
-    clearance: Tensor
-    removed: Tensor
-    iterations: int
+    inside: Tensor  # (n,) bool, which candidates belong to the set
+    clearance: Tensor  # (n, k)
+    removed: Tensor  # (n,) int64, sweep in which a candidate was removed; 0 for those inside
+    iterations: int  # sweeps until nothing more was removed
 
 
 def robust_invariant_set(
@@ -126,30 +104,21 @@ def robust_invariant_set(
     error of its own encoding is outside from the start. The error e runs over the residuals that were observed near
     :math:`z_i`, with mean :math:`\bar e`: the error of a model from pixels is far from round (a velocity is
     seen less well than a position), and a ball as large as its longest axis would cost most of the set.
+    Source: none (the paper leaves the growth of the safe set to its losses).
 
     Args:
         successors: ``(n, k, p)`` predicted successors of every candidate under every action.
-        candidates: ``(n, p)`` latents that carry no "unsafe" label.
-        outside: ``(m, p)`` latents of the unsafe label.
+        candidates: ``(n, p)`` latents that carry no "unsafe" label; sizes that differ are a ShapeError.
+        outside: ``(m, p)`` latents of the unsafe label; none are an EmptyRegionError.
         residuals: ``(n, j, p)`` observed errors of the dynamics near every candidate; none if not given.
         absorbing: ``(n,)`` bool, candidates that belong to the set whatever follows (an episode that has ended
             safely); none if not given.
         max_iterations: bound on the number of sweeps.
 
-    Returns:
-        The set, with the clearance of every action.
-
-    Raises:
-        ShapeError: if the leading sizes differ.
-        EmptyRegionError: if no unsafe latent is given.
-
-    Source: none (the paper leaves the growth of the safe set to its losses).
-
     Example:
         >>> z = torch.linspace(-1, 1, 21)[:, None]
         >>> step = torch.stack([z - 0.2, z + 0.2], 1)
-        >>> found = robust_invariant_set(step, z, torch.tensor([[-1.1], [1.1]]))
-        >>> int(found.inside.sum())
+        >>> int(robust_invariant_set(step, z, torch.tensor([[-1.1], [1.1]])).inside.sum())
         21
     """
     n, k, p = successors.shape
@@ -193,36 +162,29 @@ def robust_invariant_set(
 def nearby_residuals(
     latent: Tensor, reference: Tensor, residual: Tensor, *, count: int, spread: float, neighbours: int = 64
 ) -> tuple[Tensor, Tensor]:
-    r"""Errors of the dynamics near every latent: a sample of them, and the ends of their principal axis.
+    r"""Errors of the dynamics near every latent: some, and the mean and the ends of the principal axis ``(n, 3, p)``.
 
     .. math:: \{ \mu, \mu + s \sqrt{\lambda} v, \mu - s \sqrt{\lambda} v \}
 
     with the mean and the leading eigenpair of the covariance of the residuals of the nearest neighbours. The axis
     varies smoothly with the latent, which a handful of sampled errors would not: an invariant set that has to
-    tolerate it has a smooth border. What lies across the axis is left to the radius of the set.
+    tolerate it has a smooth border. What lies across the axis is left to the radius of the set. Source: none.
 
     Args:
         latent: ``(n, p)``.
         reference: ``(m, p)`` latents at which errors were observed.
         residual: ``(m, p)`` errors, next latent minus predicted next latent.
-        count: sampled errors per latent.
+        count: sampled errors per latent, ``(n, count, p)``.
         spread: s, in standard deviations.
         neighbours: errors that make the covariance.
 
-    Returns:
-        ``(n, count, p)`` samples and ``(n, 3, p)`` mean and ends of the axis.
-
-    Source: none.
-
     Example:
         >>> z = torch.linspace(0, 1, 100)[:, None]
-        >>> sample, axes = nearby_residuals(z[:2], z, 0.1 * torch.ones(100, 1), count=3, spread=2.0)
-        >>> sample.shape, axes.shape
-        (torch.Size([2, 3, 1]), torch.Size([2, 3, 1]))
+        >>> [e.shape for e in nearby_residuals(z[:2], z, 0.1 * torch.ones(100, 1), count=4, spread=2.0)]
+        [torch.Size([2, 4, 1]), torch.Size([2, 3, 1])]
     """
     k = min(neighbours, len(reference))
-    index = torch.as_tensor(_tree(reference).query(latent.detach().cpu().numpy(), k=k)[1]).reshape(len(latent), k)
-    local = residual[index]
+    local = residual[_nearest(latent, reference, k)[1]]
     mean = local.mean(1, keepdim=True)
     centred = local - mean
     values, vectors = torch.linalg.eigh(centred.mT @ centred / k)
@@ -233,31 +195,24 @@ def nearby_residuals(
 def barrier_targets(
     queries: Tensor, inside: Tensor, outside: Tensor, *, tube_radius: float, lipschitz_bound: float
 ) -> tuple[Tensor, Tensor]:
-    r"""Target of the barrier at any latent: the Lipschitz bound times a signed distance.
+    r"""Target ``(n,)`` of the barrier at any latent, the Lipschitz bound times a signed distance, and who is inside.
 
     .. math::
         B^\star(z) = \begin{cases} -L_B \operatorname{dist}(z, \text{outside}) & z \text{ in the tube around the set} \\
         L_B \operatorname{dist}(z, \text{tube}) & \text{else} \end{cases}
 
+    Source: none; at the set's boundary the target meets paper eq. (3)-(4) with the largest margin.
+
     Args:
         queries: ``(n, p)`` latents.
-        inside: ``(m, p)`` latents of the invariant set.
-        outside: ``(l, p)`` latents outside it, off-manifold ones included.
+        inside, outside: latents of the invariant set and outside it, off-manifold ones included; none is an
+            EmptyRegionError.
         tube_radius: distance from the inside latents up to which a latent off the manifold belongs to the set.
         lipschitz_bound: Lipschitz bound of the barrier.
 
-    Returns:
-        ``(n,)`` targets and ``(n,)`` bool, which queries belong to the set.
-
-    Raises:
-        EmptyRegionError: if either side is empty.
-
-    Source: none; at the set's boundary the target meets paper eq. (3)-(4) with the largest margin.
-
     Example:
-        >>> target, member = barrier_targets(torch.tensor([[0.0], [0.9]]), torch.tensor([[0.0], [0.1]]),
-        ...                                  torch.tensor([[0.5], [0.9]]), tube_radius=0.2, lipschitz_bound=2.0)
-        >>> target, member
+        >>> inside, outside = torch.tensor([[0.0], [0.1]]), torch.tensor([[0.5], [0.9]])
+        >>> barrier_targets(torch.tensor([[0.0], [0.9]]), inside, outside, tube_radius=0.2, lipschitz_bound=2.0)
         (tensor([-1.0000,  1.2000]), tensor([ True, False]))
     """
     near_inside = nearest_distance(queries, inside)
@@ -276,35 +231,31 @@ def reach_times(
     neighbours: int = 3,
     known_within: float | None = None,
 ) -> Tensor:
-    r"""Steps to a goal set under every action, by dynamic programming on the cloud of latents.
+    r"""Steps ``(n, k)`` to a goal set under every action, by dynamic programming on the cloud of latents.
 
-    .. math:: T(z_i, u) = 1 + \overline{T}(d(z_i, u)), \quad \overline T(z) = \operatorname{mean}_{j \in nn(z)} \min_u T(z_j, u)
+    .. math:: T(z_i, u) = 1 + \overline{T}(d(z_i, u)), \quad
+        \overline T(z) = \operatorname{mean}_{j \in nn(z)} \min_u T(z_j, u)
+
+    Source: none (the paper claims that unsafe starts return, and does not say how).
 
     Args:
         successors: ``(n, k, p)`` predicted successors of the starts.
         starts: ``(n, p)`` latents outside the goal.
         goal: ``(m, p)`` latents of the goal, where the time is zero.
-        horizon: time given to what cannot reach the goal.
+        horizon: time given to what cannot reach the goal; no time is above it by more than 1.
         neighbours: latents over which the time of a successor is averaged.
         known_within: successors farther than this from every latent are taken for a dead end: where there is no data
             the model says nothing, and a way that leads there may not lead back.
 
-    Returns:
-        ``(n, k)`` steps, at most ``horizon + 1``.
-
-    Source: none (the paper claims that unsafe starts return, and does not say how).
-
     Example:
         >>> z = torch.linspace(0, 0.9, 10)[:, None]
-        >>> steps = reach_times(torch.stack([z, z + 0.1], 1), z, torch.tensor([[1.0]]), neighbours=1)
-        >>> steps[0].tolist()
+        >>> reach_times(torch.stack([z, z + 0.1], 1), z, torch.tensor([[1.0]]), neighbours=1)[0].tolist()
         [11.0, 10.0]
     """
     n, k, p = successors.shape
     cloud = torch.cat([starts, goal])
-    distance, found = _tree(cloud).query(successors.detach().cpu().numpy().reshape(-1, p), k=neighbours)
-    index = torch.as_tensor(found).reshape(n, k, -1)
-    nearest = torch.as_tensor(distance, dtype=torch.float32).reshape(n, k, -1)[..., 0]
+    distance, found = _nearest(successors.reshape(-1, p), cloud, neighbours)
+    index, nearest = found.reshape(n, k, -1), distance[:, 0].reshape(n, k)
     unknown = torch.zeros(n, k, dtype=torch.bool) if known_within is None else nearest > known_within
     times = torch.cat([torch.full((n,), float(horizon)), torch.zeros(len(goal))])
     per_action = torch.full((n, k), float(horizon))
@@ -327,30 +278,22 @@ def safety_values(
     smoothing: float = 0.02,
     horizon: int = 60,
 ) -> Tensor:
-    r"""Least margin that an action leaves on all that follows, whatever the latent error among the given ones.
+    r"""Least margin ``(n, k)`` that an action leaves on all that follows, whatever the error among the given ones.
 
     .. math:: Q(z_i, u) = \min_e \overline V(d(z_i, u) + e), \qquad V(z_i) = \min(m_i, \max_u Q(z_i, u))
 
     with :math:`\overline V` the mean over the nearest latents, weighted by the inverse of their distance. Unlike the
-    clearance of one step it tells actions apart long before the border of what can be kept is reached.
+    clearance of one step it tells actions apart long before the border of what can be kept is reached. Source: none
+    (the paper trains its policy on the condition alone); it is Hamilton-Jacobi reachability on a cloud of latents.
 
     Args:
         successors: ``(n, k, p)`` predicted successors of every latent under every action.
-        latent: ``(n, p)`` latents.
+        latent: ``(n, p)`` latents; sizes that differ are a ShapeError.
         margin: ``(n,)`` how far a latent is from what it must not become; negative there.
         residuals: ``(n, j, p)`` observed errors of the dynamics near every latent; none if not given.
         neighbours: latents over which the value of a successor is averaged.
         smoothing: distance that is added to distances before they are inverted.
         horizon: steps looked ahead.
-
-    Returns:
-        ``(n, k)`` values Q.
-
-    Raises:
-        ShapeError: if the leading sizes differ.
-
-    Source: none (the paper trains its policy on the condition alone); the value is that of Hamilton-Jacobi
-    reachability, on a cloud of latents.
 
     Example:
         >>> z = torch.linspace(-1, 1, 21)[:, None]
@@ -367,8 +310,8 @@ def safety_values(
         )
     errors = torch.zeros(n, 1, p) if residuals is None else residuals
     ends = (successors[:, :, None] + errors[:, None]).reshape(-1, p)
-    _, found, inverse = _neighbours(ends, latent, neighbours, smoothing)
-    index, weight = found.reshape(n, k, -1, neighbours), inverse.reshape(n, k, -1, neighbours)
+    distance, found = _nearest(ends, latent, neighbours)
+    index, weight = (t.reshape(n, k, -1, neighbours) for t in (found, 1.0 / (distance + smoothing)))
     weight = weight / weight.sum(-1, keepdim=True)
     value = margin
     for _ in range(horizon):
@@ -381,17 +324,11 @@ def safety_values(
 
 
 def signed_margin(latent: Tensor, unsafe: Tensor) -> Tensor:
-    r"""Distance to the nearest unsafe latent; for unsafe ones minus the distance to the nearest of the others.
+    """Distance ``(n,)`` to the nearest unsafe latent; for unsafe ones minus that to the nearest of the others.
 
     Args:
         latent: ``(n, p)`` latents.
-        unsafe: ``(n,)`` bool.
-
-    Returns:
-        ``(n,)`` float32.
-
-    Raises:
-        EmptyRegionError: if all are unsafe, or none.
+        unsafe: ``(n,)`` bool; all or none are an EmptyRegionError.
 
     Source: none.
 
@@ -415,32 +352,27 @@ def value_targets(
     neighbours: int = 3,
     smoothing: float = 0.02,
 ) -> Tensor:
-    r"""Target of the barrier at any latent: minus the margin that a policy keeps, rising off the data.
+    r"""Target ``(n,)`` of the barrier at any latent: minus the margin that a policy keeps, rising off the data.
 
     .. math:: B^\star(z) = \max(-\overline V(z), \; L_B (\operatorname{dist}(z, \text{data}) - r))
 
     The margin V never falls along the policy's own steps, errors included, so every level set of this target is kept; a
     signed distance promises that of its zero level alone, and there nothing is left for what a network does not fit.
+    Source: none; at the set's boundary the target meets paper eq. (3)-(4).
 
     Args:
         queries: ``(n, p)`` latents.
         latent: ``(m, p)`` latents of the data.
-        value: ``(m,)`` margins V, see :func:`safety_values`.
+        value: ``(m,)`` margins V, see :func:`safety_values`, for ``neighbours`` and ``smoothing`` too.
         tube_radius: distance r from the data up to which a latent may belong to the set.
         lipschitz_bound: Lipschitz bound of the barrier.
-        neighbours: latents over which V is averaged, weighted by the inverse of their distance.
-        smoothing: distance that is added to distances before they are inverted.
-
-    Returns:
-        ``(n,)`` targets.
-
-    Source: none; at the set's boundary the target meets paper eq. (3)-(4).
 
     Example:
         >>> data, value = torch.tensor([[0.0], [1.0]]), torch.tensor([0.2, -0.1])
         >>> value_targets(torch.tensor([[0.0], [0.5]]), data, value, tube_radius=0.3, lipschitz_bound=1.0, neighbours=1)
         tensor([-0.2000,  0.2000])
     """
-    distance, found, weight = _neighbours(queries, latent, neighbours, smoothing)
+    distance, found = _nearest(queries, latent, neighbours)
+    weight = 1.0 / (distance + smoothing)
     mean = (value[found] * weight).sum(-1) / weight.sum(-1)
-    return torch.maximum(-mean, lipschitz_bound * (distance - tube_radius))
+    return torch.maximum(-mean, lipschitz_bound * (distance[:, 0] - tube_radius))
