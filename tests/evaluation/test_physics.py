@@ -10,7 +10,7 @@ from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.envs.dubins import YAW_LAG
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.evaluation.physics import evaluate_physics, filmed_episode
+from torchrl_sspl.evaluation.physics import evaluate_physics
 
 
 class Car(DubinsEnv):
@@ -91,9 +91,6 @@ def test_the_closest_call_is_filmed():
     assert walks.frames.shape[:2] == (4, 1)
     starts = torch.cat([g.states[0] for g in groups])
     assert sorted(walks.states[0].tolist()) == sorted(starts.tolist())
-    film = filmed_episode(agent, Car(), torch.tensor([-1.7, 0.1, 0.0]), sizes(1, 0.5))
-    assert film.frames.shape == (6, 1, 3, 64, 64)
-    assert torch.allclose(film.states[0, 0], torch.tensor([-1.7, 0.1, 0.0]))
 
 
 def test_a_lagging_car_starts_walks_in_the_states_of_its_twin():

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
-from torchrl.envs import EnvBase
 
 from torchrl_sspl.certification.conditions import closed_loop_lipschitz
 from torchrl_sspl.certification.record import NOTHING, RIMS, Counts, Record
@@ -19,6 +18,7 @@ from torchrl_sspl.configs.reader import EnvFactory, resolve
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, NonFiniteError, SSPLError
 from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, RandomController
+from torchrl_sspl.evaluation.measurements import MakeEnv
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.functional import covering_radius
 from torchrl_sspl.modules.agent import Agent, hosted
@@ -26,24 +26,17 @@ from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 _COVERED = 4000  # observations of which a covering radius is computed, from an environment's own resets
-_BARELY = (
-    1e-4  # of the barrier's range: another machine may round a decision that is closer than this to the other side
-)
+_BARELY = 1e-4  # of the barrier's range: a decision closer than this may be rounded to the other side elsewhere
 _GRID = 2.0**-19  # below which two trajectories are the same: networks round differently in different batches
-
-MakeEnv = Callable[..., EnvBase]
 
 
 def described_system(description: Mapping[str, Any], *, trust: bool = False) -> EnvFactory | None:
-    """Maker of the system that an agent's description names.
+    """Maker of the system that an agent's description names; None if it names none, or one that is not to be trusted.
 
     Args:
         description: of an agent: ``config.env`` with an import path ``_target_`` and its arguments, or the name of an
             environment of this library.
         trust: import what is not of this library, too. An import path runs code: trust whom the agent comes from.
-
-    Returns:
-        The maker; None if the description names none, or one that is not to be trusted.
 
     Source: none.
 
@@ -77,23 +70,18 @@ def same_system(env: SafetyEnv, twin: Any) -> bool:
         return False
     g = torch.Generator().manual_seed(0)
     state = env.sample_states(64, g, region=env.state_space)
-    action = env.action_low + torch.rand(64, env.action_dim, generator=g) * (env.action_high - env.action_low)
+    action = _random_actions(env, 64, g)
 
     def seen(system: SafetyEnv) -> list[Tensor]:
-        moved = system.wrap(system.dynamics(state, action))
-        drawn = [system.draw(x) for x in (state[:16], system.previous_state(state)[:16])]
-        bounds = torch.tensor([system.exit_region, system.max_action])
-        return [
-            moved,
-            system.region(state),
-            system.region(moved),
-            system.action_low,
-            system.action_high,
-            bounds,
-            *drawn,
-        ]
+        moved, bounds = system.wrap(system.dynamics(state, action)), [system.exit_region, system.max_action]
+        told = [moved, system.region(state), system.region(moved), system.action_low, system.action_high]
+        return [*told, torch.tensor(bounds), system.draw(state[:16]), system.draw(system.previous_state(state)[:16])]
 
     return all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(seen(env), seen(twin), strict=True))
+
+
+def _random_actions(env: SafetyEnv, n: int, g: torch.Generator) -> Tensor:
+    return env.action_low + torch.rand(n, env.action_dim, generator=g) * (env.action_high - env.action_low)
 
 
 def same_resets(make_env: MakeEnv, factory: MakeEnv) -> bool:
@@ -134,22 +122,10 @@ class Block:
     reference: Tensor  # these others
 
 
-def _values(e: Episodes) -> tuple[Tensor, Tensor]:
-    """Latents and barrier values, which episodes of an agent have."""
-    assert e.latent is not None
-    assert e.barrier is not None
-    return e.latent, e.barrier
-
-
-def _errors(e: Episodes) -> Tensor:
-    assert e.prediction_error is not None
-    return e.prediction_error
-
-
 def counted(e: Episodes, level: float, tolerated: float | None, slack: float = 0.0) -> tuple[dict[str, int], Tensor]:
-    """Events by name, those by more than a share of the barrier's range, and the largest error of each episode ``(n,)``."""
-    alive, barrier, unsafe = e.alive, _values(e)[1].double(), (e.region == UNSAFE) & e.alive
-    error = torch.where(alive[1:], _errors(e).double(), 0.0)
+    """Events by name, by more than a share of the barrier's range, and the largest error of each episode ``(n,)``."""
+    alive, barrier, unsafe = e.alive, e.barrier.double(), (e.region == UNSAFE) & e.alive
+    error = torch.where(alive[1:], e.prediction_error.double(), 0.0)
     worst = torch.where(error.isnan(), math.inf, error).amax(0)
     margin = slack * _range(barrier[alive], level)
     events = {
@@ -171,9 +147,9 @@ def _range(barrier: Tensor, level: float) -> float:
 
 def _rims(e: Episodes, level: float) -> dict[str, tuple[int, float]]:
     """Steps and largest error, by where in the set a step began."""
-    rims, before = {}, _values(e)[1][:-1] - level
+    rims, before = {}, e.barrier[:-1] - level
     for name, (lower, upper) in RIMS.items():
-        here = _errors(e)[e.alive[1:] & (before > lower) & (before <= upper)]
+        here = e.prediction_error[e.alive[1:] & (before > lower) & (before <= upper)]
         if len(here) and bool(here.isfinite().all()):
             rims[name] = (len(here), float(here.max()))
     return rims
@@ -202,29 +178,24 @@ class StateBlocks:
         latent = torch.cat([inside, unsafe_latent, safe_latent])
         beyond = ~(latent.abs() <= 1.0).all(1)
         run = self._run(start) if len(start) else None
-        counts, worst, steps = NOTHING, torch.zeros(0), torch.zeros(0, dtype=torch.int64)
-        rims: dict[str, tuple[int, float]] = {}
-        least = counts
+        counts = least = NOTHING
+        worst, steps, rims = torch.zeros(0), torch.zeros(0, dtype=torch.int64), dict[str, tuple[int, float]]()
         if run is not None:
             steps, rims = run.alive.sum(0) - 1, _rims(run, self.level)
             found, worst = counted(run, self.level, self.tolerated)
             sure = counted(run, self.level, self.tolerated, _BARELY)[0]
             counts, least = (replace(NOTHING, episodes=len(start), steps=int(steps.sum()), **k) for k in (found, sure))
         elif len(start):
-            counts = replace(
-                NOTHING, episodes=len(start), undefined=len(start), events=len(start), exceeding=len(start)
-            )
-            least, worst, steps = (
-                counts,
-                torch.full((len(start),), math.inf),
-                torch.zeros(len(start), dtype=torch.int64),
-            )
+            k = len(start)
+            counts = least = replace(NOTHING, episodes=k, undefined=k, events=k, exceeding=k)
+            worst, steps = torch.full((k,), math.inf), torch.zeros(k, dtype=torch.int64)
         margin = _BARELY * _range(unsafe, self.level)
         mistaken, surely = (int((~(unsafe > self.level - m)).sum()) for m in (0.0, margin))
         seen = {"shown": len(unsafe), "seen": len(latent), "outside": int(beyond.sum())}
         return Block(
             replace(counts, mistaken=mistaken, **seen), replace(least, mistaken=surely, **seen), 0, worst, steps,
-            fingerprint(start), fingerprint(unsafe_state), rims, inside, safe, unsafe, latent, self._see(None, reference_state),
+            fingerprint(start), fingerprint(unsafe_state), rims, inside, safe, unsafe, latent,
+            self._see(None, reference_state),
         )  # fmt: skip
 
     def _run(self, start: Tensor) -> Episodes | None:
@@ -264,10 +235,7 @@ class StateBlocks:
         env, before, after, found = self.env, [], [], 0
         for _ in range(60):
             state = env.sample_states(max(4 * n, 2000), g, region=env.state_space)
-            action = env.action_low + torch.rand(len(state), env.action_dim, generator=g) * (
-                env.action_high - env.action_low
-            )
-            moved = env.wrap(env.dynamics(state, action))
+            moved = env.wrap(env.dynamics(state, _random_actions(env, len(state), g)))
             enters = (env.region(state) != UNSAFE)[:, 0] & (env.region(moved) == UNSAFE)[:, 0]
             before.append(state[enters])
             after.append(moved[enters])
@@ -299,14 +267,14 @@ class ResetBlocks:
         finally:
             env.close()
         both = own.joined(at_random)
-        own_latent, own_barrier = _values(own)
-        latent, barrier = _values(both)
+        barrier, own_barrier = both.barrier, own.barrier
         start = own.select(~(own_barrier[0] > level))  # a start that is no number counts, as an event
         shown, margin = (both.region == UNSAFE) & both.alive, _BARELY * _range(barrier[both.alive], level)
-        seen = latent[both.alive]
+        seen = both.latent[both.alive]
         counts, least = (
             replace(
-                NOTHING, episodes=len(start), steps=int(start.alive[1:].sum()), **counted(start, level, self.tolerated, s)[0],
+                NOTHING, episodes=len(start), steps=int(start.alive[1:].sum()),
+                **counted(start, level, self.tolerated, s)[0],
                 shown=int(shown.any(0).sum()), mistaken=int((shown & ~(barrier > level - m)).any(0).sum()),
                 seen=len(seen), outside=int((~(seen.abs() <= 1.0).all(1)).sum()),
             )
@@ -314,11 +282,11 @@ class ResetBlocks:
         )  # fmt: skip
         near = ((own_barrier[0] - level).abs() <= margin).sum()
         worst = counted(start, level, self.tolerated)[1]
-        mine, inside = own_latent[own.alive], own_barrier[own.alive] <= level
+        mine, inside = own.latent[own.alive], own_barrier[own.alive] <= level
         safe = barrier[(both.region == SAFE) & both.alive]
         return Block(
             counts, least, int(near), worst, start.alive.sum(0) - 1, _trajectories(start), [], _rims(start, level),
-            mine[inside], safe, barrier[shown], mine, _values(at_random)[0][at_random.alive],
+            mine[inside], safe, barrier[shown], mine, at_random.latent[at_random.alive],
         )  # fmt: skip
 
 
@@ -326,23 +294,19 @@ def _undefined(n: int, p: int) -> Block:
     """Episodes that there are none of, as the policy gives no number: every one of them is an event."""
     counts = replace(NOTHING, episodes=n, undefined=n, events=n, exceeding=n, shown=n, mistaken=n)
     lost, none, nowhere = torch.full((n,), math.inf), torch.zeros(0), torch.zeros(0, p)
-    steps = torch.zeros(n, dtype=torch.int64)
-    return Block(
-        counts, counts, 0, lost, steps, [str(k) for k in range(n)], [], {}, nowhere, none, none, nowhere, nowhere
-    )
+    steps, prints = torch.zeros(n, dtype=torch.int64), [str(k) for k in range(n)]
+    return Block(counts, counts, 0, lost, steps, prints, [], {}, nowhere, none, none, nowhere, nowhere)
 
 
 def _trajectories(e: Episodes) -> list[str]:
     """Fingerprints of where episodes begin, go on and end: of true states, or of latents where those are not told."""
-    path = e.states if e.states is not None else e.latent
-    assert path is not None
     if not len(e):
         return []
+    path = e.latent if e.states is None else e.states
     last = e.alive.sum(0) - 1
     picked = [path[torch.minimum(last, torch.tensor(k)), torch.arange(len(e))] for k in (0, 1, 2)]
-    return fingerprint(
-        torch.cat([*picked, path[last, torch.arange(len(e))], last[:, None].to(path.dtype)], 1), grid=_GRID
-    )
+    ends = [path[last, torch.arange(len(e))], last[:, None].to(path.dtype)]
+    return fingerprint(torch.cat([*picked, *ends], 1), grid=_GRID)
 
 
 def summarise(record: Record, blocks: Sequence[Block], agent: Agent) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, maximise
 from torchrl_sspl.certification.certificate import (
@@ -36,10 +37,7 @@ from torchrl_sspl.certification.floating import UNITS, largest_rounding
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
 from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.rounding import missed, shown
-from torchrl_sspl.certification.statistics import (
-    paper_layer,
-    statistical_layer,
-)
+from torchrl_sspl.certification.statistics import paper_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CertificationError, CheckpointError, SSPLError
 from torchrl_sspl.evaluation.blocks import (
@@ -86,7 +84,7 @@ def certify(
     budget: Budget | None = None,
     progress: bool = False,
 ) -> Certificate:
-    r"""Certifies a frozen agent: the set {B <= s} with the largest s <= 0 that is proved to be kept.
+    """Certifies a frozen agent: the set {B <= s} with the largest s <= 0 that is proved to be kept.
 
     Args:
         agent: frozen agent.
@@ -95,16 +93,13 @@ def certify(
         level: s, barrier units; searched for if not given.
         episodes: number of fresh episodes from the set, and of fresh observations of U.
         horizon: steps per episode.
-        seed: root of the seeds of the fresh data, which are drawn in a purpose of their own; default: that of the agent's
-            configuration.
+        seed: root of the seeds of the fresh data, which are drawn in a purpose of their own; default: that of the
+            agent's configuration.
         used_seeds: seeds with which anything was trained, chosen or tuned, beside those that the agent itself names.
         confidence: of all bounds together.
         acceptable: risk per episode, and per observation of U, above which a bound does not hold.
         budget: of each search of the deterministic layer.
         progress: show progress bars.
-
-    Returns:
-        The certificate.
 
     Raises:
         ConfigError: if a setting is out of range.
@@ -120,11 +115,10 @@ def certify(
         return _proved(agent, name, level, budget)
     factory = described_system(agent.description)
     system = "described" if factory is not None and same_system(env, factory([1], 0)) else "given"
-    root = _root_seed(agent) if seed is None else seed
-    record = Record("states", system, root, episodes, horizon, 1, confidence, acceptable, _used(agent, used_seeds))
+    root, used = _root_seed(agent) if seed is None else seed, _used(agent, used_seeds)
+    record = Record("states", system, root, episodes, horizon, 1, confidence, acceptable, used)
     certificate = _proved(agent, name, level, budget)
-    _measure(certificate, agent, StateBlocks(agent, env, record, certificate.level), record, progress)
-    return certificate
+    return _measured(certificate, agent, StateBlocks(agent, env, record, certificate.level), progress)
 
 
 def certify_on_episodes(
@@ -143,36 +137,21 @@ def certify_on_episodes(
     budget: Budget | None = None,
     progress: bool = False,
 ) -> Certificate:
-    r"""Certifies a frozen agent for an environment that is known only by being run.
+    """Certifies a frozen agent for an environment that is known only by being run.
 
     What the weights prove is the same as with :func:`certify`. What is measured are episodes from the environment's own
-    resets, half under the policy, half under random actions: those under the policy that start in the set, and of all that
-    show U, whether one observation of it has B <= s. Episodes are drawn in blocks, each from a newly made and seeded
-    environment, until there are enough of both; when to stop depends on their numbers alone, never on what happened in them.
+    resets, half under the policy, half under random actions: those under the policy that start in the set, and of all
+    that show U, whether one observation of it has B <= s. Episodes are drawn in blocks, each from a newly made and
+    seeded environment, until there are enough of both; when to stop depends on their numbers alone, never on what
+    happened in them. Source: paper Theorem 1; deviation: as for :func:`certify`.
 
     Args:
         agent: frozen agent.
         make_env: ``(batch_size=[k], seed=...) -> environment`` with ``"pixels"`` and ``"region"``.
-        name: name of the agent.
-        level: s, barrier units; searched for if not given.
         episodes: number of fresh episodes from the set, and of fresh episodes that show U. At least as many are drawn
             under the policy, and under random actions, and at most three times as many.
-        horizon: steps per episode.
         envs: environments stepped together.
-        seed: as for :func:`certify`.
-        used_seeds: as for :func:`certify`.
-        confidence: as for :func:`certify`.
-        acceptable: as for :func:`certify`.
-        budget: of each search.
-        progress: show progress bars.
-
-    Returns:
-        The certificate.
-
-    Raises:
-        ConfigError: if a setting is out of range.
-
-    Source: paper Theorem 1; deviation: as for :func:`certify`.
+        name, level, horizon, seed, used_seeds, confidence, acceptable, budget, progress: as for :func:`certify`.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
@@ -183,28 +162,22 @@ def certify_on_episodes(
     """
     factory = described_system(agent.description)
     system = "described" if factory is not None and same_resets(make_env, factory) else "given"
-    root = _root_seed(agent) if seed is None else seed
-    record = Record("resets", system, root, episodes, horizon, envs, confidence, acceptable, _used(agent, used_seeds))
+    root, used = _root_seed(agent) if seed is None else seed, _used(agent, used_seeds)
+    record = Record("resets", system, root, episodes, horizon, envs, confidence, acceptable, used)
     certificate = _proved(agent, name, level, budget)
-    _measure(certificate, agent, ResetBlocks(agent, make_env, record, certificate.level), record, progress)
-    return certificate
+    return _measured(certificate, agent, ResetBlocks(agent, make_env, record, certificate.level), progress)
 
 
 def issue(path: str | Path, env: SafetyEnv | MakeEnv | None = None, **settings: Any) -> Certificate:
-    """Certifies the agent of a directory anew, and keeps the certificate beside it.
+    """Certifies the agent of a directory anew, and keeps the certificate beside it. Source: none.
 
     Args:
         path: name of a shipped agent, a run directory or the directory of an agent.
         env: the true system, or a maker of environments; default: as the agent's description says.
         **settings: those of :func:`certify` or :func:`certify_on_episodes`; default: those of the present certificate.
 
-    Returns:
-        The certificate.
-
     Raises:
         CheckpointError: if the agent cannot be read.
-
-    Source: none.
     """
     directory = agent_directory(path)
     agent = Agent.load(directory)
@@ -249,9 +222,7 @@ def _proved(agent: Agent, name: str, level: float | None, budget: Budget | None)
     """A certificate with what the weights prove."""
     budget = budget or Budget(seconds=300.0)
     if level is None:
-        parts = (agent.barrier, agent.dynamics, agent.policy)
-        options: dict[str, Any] = {"latent_dim": agent.latent_dim, "lipschitz_bound": agent.lipschitz_bound}
-        level = level_that_holds(*parts, **options, budget=budget)
+        level = level_that_holds(**_loop(agent), budget=budget)
     label = re.sub(r"[^\w .,()+-]", "_", name)[:80] or "agent"
     layers = {"deterministic": _proof(agent, level, budget)}
     return Certificate(label, weights_digest(agent.state_dict()), _configuration(agent), level, layers)
@@ -262,17 +233,14 @@ def _configuration(agent: Agent) -> str:
     return configuration_digest(certified)
 
 
+def _loop(agent: Agent) -> dict[str, Any]:
+    """What the proofs are about."""
+    sizes = {"latent_dim": agent.latent_dim, "lipschitz_bound": agent.lipschitz_bound}
+    return {"barrier": agent.barrier, "dynamics": agent.dynamics, "policy": agent.policy, **sizes}
+
+
 def _proof(agent: Agent, level: float, budget: Budget) -> Layer:
-    return deterministic_layer(
-        agent.barrier,
-        agent.dynamics,
-        agent.policy,
-        latent_dim=agent.latent_dim,
-        lipschitz_bound=agent.lipschitz_bound,
-        level=level,
-        multipliers=_witness(agent),
-        budget=budget,
-    )
+    return deterministic_layer(**_loop(agent), level=level, multipliers=_witness(agent), budget=budget)
 
 
 def _witness(agent: Agent) -> list[Tensor] | None:
@@ -289,12 +257,10 @@ def _witness(agent: Agent) -> list[Tensor] | None:
     return [torch.tensor(row, dtype=torch.float64) for row in rows]
 
 
-def _measure(certificate: Certificate, agent: Agent, source: Any, record: Record, progress: bool) -> None:
-    """Draws blocks until there are enough, and adds the layers that follow."""
-    from tqdm import tqdm
-
+def _measured(certificate: Certificate, agent: Agent, source: Any, progress: bool) -> Certificate:
+    """The certificate with the layers that follow from blocks, drawn until there are enough."""
     source.tolerated = _tolerated(certificate)
-    blocks: list[Block] = []
+    record, blocks = source.record, list[Block]()
     with tqdm(desc="certificate", unit="block", disable=not progress, leave=False) as bar:
         while not record.complete():
             blocks.append(source(len(blocks)))
@@ -304,6 +270,7 @@ def _measure(certificate: Certificate, agent: Agent, source: Any, record: Record
     record.check()
     certificate.record = record
     certificate.layers |= _measured_layers(record, certificate, agent)
+    return certificate
 
 
 def _tolerated(certificate: Certificate) -> float | None:
@@ -316,9 +283,6 @@ def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> 
         "statistical": statistical_layer(record, tolerated_error=_tolerated(certificate)),
         "paper": paper_layer(record, agent.lipschitz_bound),
     }
-
-
-# --- verification -----------------------------------------------------------------------------------------------------
 
 
 class _TimeUp(Exception):
@@ -343,27 +307,25 @@ def verify_run(
 ) -> int:
     """Checks a certificate again: every number and word of it, from the weights and from the same episodes.
 
-    Digest, weights, configuration and every measured statement (which follow from the counts) are compared first, then the
-    proofs are found again, then blocks of episodes are measured again, in an order that nobody can foresee, as many as a third
-    of the time allows. What is not checked again is printed as claimed.
+    Digest, weights, configuration and every measured statement (which follow from the counts) are compared first, then
+    the proofs are found again, then blocks of episodes are measured again, in an order that nobody can foresee, as many
+    as a third of the time allows. What is not checked again is printed as claimed. Source: none.
 
     Args:
         name: name of a shipped agent, a run directory or the directory of an agent.
         env: the true system, or a maker of environments, where the agent does not say how to build it.
-        measure: True: measure all blocks again, whatever time it takes, and import the system that the agent names, wherever
-            it comes from (it runs code of its own); False: none; default: as above, with systems of this library only.
+        measure: True: measure all blocks again, whatever time it takes, and import the system that the agent names,
+            wherever it comes from (it runs code of its own); False: none; default: as above, with systems of this
+            library only.
         seconds: time for everything (without ``measure=True``).
-        report: called with every line that a person should read.
+        report: called with every line that a person should read, the reasons of a failure among them.
 
     Returns:
-        An exit code, see :class:`Exit`: 0 if everything was found again, 1 if something is claimed that is not so, 3 if there
-        is no certificate or the file is none, 4 if the agent cannot be read, 5 if the time was too short; the reasons are
-        reported.
+        An exit code: 0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no
+        certificate or the file is none, 4 if the agent cannot be read, 5 if the time was too short.
 
     Raises:
         CheckpointError: if there is no such agent.
-
-    Source: none.
 
     Example:
         >>> verify_run("pendulum", measure=False, report=lambda line: None)
@@ -388,7 +350,7 @@ def verify_run(
 
 @contextmanager
 def _limit(seconds: float) -> Iterator[None]:
-    """Raises _TimeUp in the block after a while, where the platform can interrupt it (the main thread, not on Windows)."""
+    """Raises _TimeUp in the block after a while, where it can be interrupted (in the main thread, not on Windows)."""
     usable = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
     if not usable or not math.isfinite(seconds):
         yield
@@ -440,7 +402,7 @@ def _verify(
     _refuse(found)
     left = math.inf if measure else min(seconds / 3, seconds - (time.monotonic() - began))
     measured = _measured_again(claimed, agent, env, measure, left)
-    _print(claimed, agent, again, measured, report)
+    _print(claimed, measured, report)
 
 
 def _refuse(found: Mapping[Reason, str]) -> None:
@@ -463,8 +425,7 @@ def _history(claimed: Certificate, agent: Agent) -> dict[Reason, str]:
 def _is_proved(agent: Agent, level: float, name: str, delta: float, budget: Budget) -> bool | None:
     """Whether the set is kept with errors of delta, by real numbers or by those of a dtype; None: not decided."""
     bound = agent.lipschitz_bound
-    parts = (agent.barrier, agent.dynamics, agent.policy)
-    system = closed_loop(*parts, latent_dim=agent.latent_dim, lipschitz_bound=bound)
+    system = closed_loop(**_loop(agent))
     inside, lost = level, 0.0
     if name != TOLERATED:
         unit = UNITS[getattr(torch, name)]
@@ -538,10 +499,9 @@ def _summary_changes(claimed: Record, found: Record, close: int) -> str:
     """Numbers beside the counts that are not those measured again."""
     wrong = []
     for name, value in claimed.sizes.items():
-        slack = close + 2 if name in ("repeated", "leaked") else close + max(2, found.sizes[name] // 500)
-        if not value >= found.sizes[name] - slack or (
-            name not in ("repeated", "leaked") and value > found.sizes[name] + slack
-        ):
+        few = name in ("repeated", "leaked")
+        slack = close + (2 if few else max(2, found.sizes[name] // 500))
+        if not value >= found.sizes[name] - slack or (not few and value > found.sizes[name] + slack):
             wrong.append(f"{name} claimed {value}, measured {found.sizes[name]}")
     for key, number in claimed.numbers.items():
         other = found.numbers[key]
@@ -558,15 +518,12 @@ def _summary_changes(claimed: Record, found: Record, close: int) -> str:
     return "; ".join(wrong)
 
 
-def _print(
-    claimed: Certificate, agent: Agent, again: Certificate, unmeasured: str, report: Callable[[str], None]
-) -> None:
+def _print(claimed: Certificate, unmeasured: str, report: Callable[[str], None]) -> None:
     """Every statement, with what was done about it."""
     for layer in claimed.layers.values():
         proof = layer.name == "deterministic"
-        partly = not proof and unmeasured.endswith("at random") and layer.name == "statistical"
         checked = "checked again" if proof or not unmeasured else f"not checked again ({unmeasured})"
-        if partly:
+        if layer.name == "statistical" and unmeasured.endswith("at random"):
             checked = f"checked again on {unmeasured}"
         report(f"{layer.name:14s} {checked}: {layer.verdict}")
         for s in layer.statements:

@@ -16,25 +16,18 @@ from torchrl_sspl.evaluation.measurements import Draw
 from torchrl_sspl.modules.agent import Agent, hosted
 
 CHUNK = 1000  # frames drawn and encoded at a time
+_NONE: Any = None
 
 
 @dataclass
 class Decision:
-    """What a controller does with the observations of n episodes, and what it thinks of them.
+    """What a controller does with the observations of n episodes, and what it thinks of them; None where nothing."""
 
-    Attributes:
-        action: ``(n, m)``, physical units; None where it only watched.
-        barrier: ``(n,)``, at most zero means safe; None without a barrier.
-        latent: ``(n, p)``; None without an encoder.
-        predicted: ``(n, p)`` the next latent that it expects; None without a model.
-        predicted_barrier: ``(n,)`` barrier of the latter.
-    """
-
-    action: Tensor | None = None
-    barrier: Tensor | None = None
-    latent: Tensor | None = None
-    predicted: Tensor | None = None
-    predicted_barrier: Tensor | None = None
+    action: Tensor = _NONE  # (n, m), physical units
+    barrier: Tensor = _NONE  # (n,), at most zero means safe
+    latent: Tensor = _NONE  # (n, p)
+    predicted: Tensor = _NONE  # (n, p) the next latent that it expects
+    predicted_barrier: Tensor = _NONE  # (n,) barrier of the latter
 
     def _map(self, function: Callable[[Tensor, str], Tensor]) -> Decision:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
@@ -58,9 +51,9 @@ class Decision:
 class Controller(Protocol):
     """Anything that acts, with memory if it wants: what :func:`simulate` asks, episodes side by side.
 
-    ``reads`` names what it sees: ``"pixels"`` (two stacked frames uint8 ``(k, 6, H, W)``), ``"state"`` (true states), or
-    another key of the environment. An optional ``watch(observation, rows)``, with the arguments and the result of ``step``,
-    is asked in place of it about observations that are not acted on: the last of an episode.
+    ``reads`` names what it sees: ``"pixels"`` (two stacked frames uint8 ``(k, 6, H, W)``), ``"state"`` (true states),
+    or another key of the environment. An optional ``watch(observation, rows)``, with the arguments and the result of
+    ``step``, is asked in place of it about observations that are not acted on: the last of an episode.
     """
 
     reads: str
@@ -69,7 +62,7 @@ class Controller(Protocol):
         """Forget everything (new episodes, perhaps of another number), or what belongs to some of the n episodes."""
 
     def step(self, observation: Tensor, rows: Tensor | None = None) -> Decision:
-        """Actions for k observations; ``rows (k,)`` says which of the n episodes they belong to, None: all, in order."""
+        """Actions for k observations; ``rows (k,)`` says which of the n episodes they belong to, None: all."""
         ...
 
 
@@ -111,14 +104,12 @@ class Camera:
 
 
 class AgentController:
-    """An agent in a closed loop; of a film of states every frame is encoded once, where the encoder can.
+    """An agent in a closed loop; of a film of states every frame is encoded once, where the encoder can. Source: none.
 
     Args:
         agent: frozen agent; its encoder stays on its device.
         driver: a controller on pixels that acts in place of the agent's policy, while the agent watches: its barrier
             values and predictions are those of the actions taken.
-
-    Source: none.
 
     Example:
         >>> from torchrl_sspl.modules.agent import load
@@ -151,23 +142,17 @@ class AgentController:
     def watch(self, observation: Tensor | Camera, rows: Tensor | None = None) -> Decision:
         """Latents and barrier values of observations; arguments as for :meth:`step`."""
         latent = self._see(observation, rows)
-        return Decision(None, self.agent.barrier(latent)[:, 0], latent).rows(rows)
+        return Decision(barrier=self.agent.barrier(latent)[:, 0], latent=latent).rows(rows)
 
     @torch.no_grad()
     def step(self, observation: Tensor | Camera, rows: Tensor | None = None) -> Decision:
-        """Actions, barrier values and predictions; see :class:`Controller`.
-
-        Args:
-            observation: uint8 ``(k, 6, H, W)``, or a camera.
-            rows: ``(k,)`` which of the n episodes these belong to.
-        """
+        """Actions, barrier values and predictions for observations ``(k, 6, H, W)`` or a camera."""
         # All n at a time: a row's result does not depend on how many others are asked for.
         latent, agent = self._see(observation, rows), self.agent
         if self.driver is None:
             action = agent.policy(latent)
         else:
             chosen = self.driver.step(observation, rows).action  # type: ignore[arg-type]
-            assert chosen is not None
             action = chosen if rows is None or self._action is None else self._action.index_copy(0, rows, chosen)
             self._action = action
         predicted = agent.dynamics(latent, action)
@@ -194,21 +179,8 @@ class AgentController:
         return latent
 
 
-class FunctionController:
-    """A plain function of the present observation: a bare policy, another library's, a rival's.
-
-    Args:
-        function: observation ``(k, ...)`` -> action ``(k, m)`` or ``(k,)``, or the pair of it and a barrier value ``(k,)``
-            or ``(k, 1)``; tensors, arrays of actions too.
-        reads: what it sees, see :class:`Controller`.
-
-    Source: none.
-
-    Example:
-        >>> push = FunctionController(lambda pixels: torch.ones(len(pixels)))
-        >>> push.step(torch.zeros(3, 6, 8, 8)).action.shape
-        torch.Size([3, 1])
-    """
+class _FunctionController:
+    """A plain function of the present observation, to tensors, or arrays of actions."""
 
     def __init__(self, function: Callable[[Any], Any], reads: str = "pixels") -> None:
         self.function, self.reads = function, reads
@@ -218,32 +190,32 @@ class FunctionController:
 
     @torch.no_grad()
     def step(self, observation: Tensor, rows: Tensor | None = None) -> Decision:
-        """What the function says; see :class:`Controller`."""
         found, n = self.function(observation), len(observation)
         found, barrier = found if isinstance(found, tuple) and len(found) == 2 else (found, None)
         if not isinstance(found, (Tensor, np.ndarray)) or not (barrier is None or isinstance(barrier, Tensor)):
             raise ConfigError(
-                "controller: expected a function observation -> action, or (action, barrier), received one that returns "
-                f"{type(found).__name__} and {type(barrier).__name__}; one with memory has reset(rows) and step(observation, rows)"
+                "controller: expected a function observation -> action, or (action, barrier), received one that returns"
+                f" {type(found).__name__} and {type(barrier).__name__}; one with memory has reset(rows) and "
+                "step(observation, rows)"
             )
         action = torch.as_tensor(found, dtype=torch.float32).cpu()
         if action.ndim < 1 or len(action) != n or (barrier is not None and barrier.numel() != n):
             shapes = tuple(action.shape), None if barrier is None else tuple(barrier.shape)
-            raise ShapeError(f"controller: expected one action (and barrier value) for each of {n} observations, received {shapes}")
-        return Decision(action.reshape(n, -1), None if barrier is None else barrier.reshape(n).float().cpu())
+            raise ShapeError(
+                f"controller: expected one action (and barrier value) for each of {n} observations, received {shapes}"
+            )
+        return Decision(action.reshape(n, -1), barrier if barrier is None else barrier.reshape(n).float().cpu())
 
 
 class RandomController:
     """Uniform actions within bounds, whatever is seen.
 
     The sequence depends on the seed and the number of steps only: an episode that begins anew keeps the action that was
-    drawn for its row.
+    drawn for its row. Source: none.
 
     Args:
         low, high: bounds ``(m,)`` of the action.
         seed: of the sequence, which no reset begins anew.
-
-    Source: none.
 
     Example:
         >>> random = RandomController(torch.tensor([-2.0]), torch.tensor([2.0]), seed=0)
@@ -284,21 +256,16 @@ class RandomController:
 
 
 def as_controller(acts: Any, reads: str | None = None) -> Controller:
-    """A controller of anything that acts.
+    """A controller of anything that acts. Source: none.
 
     Args:
-        acts: an agent, a controller, a policy of stable-baselines3 (with ``predict``, or that method), a policy of TorchRL
-            (from its first in-key to ``"action"``), an object with ``act``, or a function observation -> action, or
-            observation -> (action, barrier).
+        acts: an agent, a controller, a policy of stable-baselines3 (with ``predict``, or that method), a policy of
+            TorchRL (from its first in-key to ``"action"``), an object with ``act``, or a function observation ``(k,
+            ...)`` -> action ``(k, m)`` or ``(k,)``, or -> (action, barrier ``(k,)`` or ``(k, 1)``).
         reads: what it sees, ``"pixels"`` by default; see :class:`Controller`.
-
-    Returns:
-        The controller.
 
     Raises:
         ConfigError: if it is none of these.
-
-    Source: none.
 
     Example:
         >>> as_controller(lambda state: -state[:, :1], reads="state").step(torch.ones(2, 2)).action.tolist()
@@ -313,25 +280,14 @@ def as_controller(acts: Any, reads: str | None = None) -> Controller:
     if isinstance(acts, Agent):
         return AgentController(acts)
     if callable(getattr(acts, "predict", None)):
-        return FunctionController(lambda seen: acts.predict(seen.cpu().numpy(), deterministic=True), reads)
+        return _FunctionController(lambda seen: acts.predict(seen.cpu().numpy(), deterministic=True), reads)
     if hasattr(acts, "in_keys") and "action" in getattr(acts, "out_keys", ()):
         key = acts.in_keys[0]
-        return FunctionController(lambda seen: acts(TensorDict({key: seen}, [len(seen)]))["action"], key)
+        return _FunctionController(lambda seen: acts(TensorDict({key: seen}, [len(seen)]))["action"], key)
     function = acts.act if callable(getattr(acts, "act", None)) else acts
     if not callable(function):
         raise ConfigError(
-            "controller: expected an agent, a controller (reset, step), a policy (predict, act) or a function observation -> "
-            f"action, received an object of type {type(acts).__name__}"
+            "controller: expected an agent, a controller (reset, step), a policy (predict, act) or a function "
+            f"observation -> action, received an object of type {type(acts).__name__}"
         )
-    return FunctionController(function, reads)
-
-
-__all__ = [
-    "AgentController",
-    "Camera",
-    "Controller",
-    "Decision",
-    "FunctionController",
-    "RandomController",
-    "as_controller",
-]
+    return _FunctionController(function, reads)

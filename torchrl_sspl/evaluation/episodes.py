@@ -2,38 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torchrl.envs import EnvBase
 
 from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.evaluation.controllers import AgentController, RandomController, as_controller
-from torchrl_sspl.evaluation.measurements import Evaluation, Measurement, quantiles, share
+from torchrl_sspl.evaluation.measurements import Evaluation, MakeEnv, Measurement, quantiles
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.sets import SAFE, UNSAFE
 
-MakeEnv = Callable[..., EnvBase]
+_CALLED = {"unsafe_called_safe": UNSAFE, "safe_called_unsafe": SAFE}
 
 
 @torch.no_grad()
 def separating_level(episodes: Sequence[Episodes], guard: float, reserve: float = 0.0) -> float:
-    r"""Level c for which :math:`\{B \le c\}` holds no labelled unsafe observation, and keeps away from others like these.
+    r"""Level c for which :math:`\{B \le c\}` holds no labelled unsafe observation, and keeps away from its like.
 
     .. math:: c = \min\bigl(0,\; u - g,\; \max(-r, \tfrac{s + u}{2})\bigr), \qquad u = \min_U B, \quad s = \max_S B
+
+    It lowers, never raises; it is zero where no observation of U was seen. Source: none.
 
     Args:
         episodes: held-out episodes, with a barrier.
         guard: g, distance that observations of U keep from the level.
         reserve: r, what one step from :math:`\{B \le 0\}` leaves below zero, so that levels down to -r are kept as
             zero is. Within it the level is lowered to the middle between U and S, where that leaves all of S inside.
-
-    Returns:
-        The level: lowered, never raised; zero where no observation of U was seen.
-
-    Source: none.
     """
     judged = [(e, e.barrier) for e in episodes if e.barrier is not None]
     unsafe, safe = (torch.cat([b[(e.region == code) & e.alive] for e, b in judged]) for code in (UNSAFE, SAFE))
@@ -47,7 +43,7 @@ def separating_level(episodes: Sequence[Episodes], guard: float, reserve: float 
 def evaluate_episodes(
     agent: Any, make_env: MakeEnv, config: EvaluationConfig | None = None, *, progress: bool = False
 ) -> Evaluation:
-    r"""Measures an agent, or anything else that acts, on fresh episodes; each share counts independent episodes.
+    """Measures an agent, or anything else that acts, on fresh episodes; each share counts independent episodes.
 
     Args:
         agent: frozen agent, or what ``as_controller`` takes; what needs a barrier is not measured without one.
@@ -81,8 +77,8 @@ def evaluate_episodes(
         env.close()
     out = Evaluation()
     touches, random_touches = (((e.region == UNSAFE) & e.alive).any(0) for e in (own, chance))
-    out.add(share("policy_touch_unsafe", int(touches.sum()), len(touches), "all episodes under the policy"))
-    out.add(share("random_touch_unsafe", int(random_touches.sum()), len(random_touches), "episodes under random actions"))
+    out.count("policy_touch_unsafe", touches, "all episodes under the policy")
+    out.count("random_touch_unsafe", random_touches, "episodes under random actions")
     if own.barrier is None:
         out.missing("starts_inside", "touch_unsafe", "leave", *_CALLED, *(f"{name}_of_frames" for name in _CALLED))
     else:
@@ -95,12 +91,10 @@ def evaluate_episodes(
         bound, generator = acts.agent.lipschitz_bound, torch.Generator().manual_seed(config.seed)
         lower = lipschitz_lower(acts.agent.barrier, -1.0, 1.0, n=20000, generator=generator)
         out.add(Measurement("lipschitz_certified", bound, "barrier / latent", note="bound of the barrier"))
-        out.add(Measurement("lipschitz_sampled", lower, "barrier / latent", 20000, note="largest gradient or secant found"))
+        note = "largest gradient or secant found"
+        out.add(Measurement("lipschitz_sampled", lower, "barrier / latent", 20000, note=note))
     out.arrays.update(own=own, chance=chance)
     return out
-
-
-_CALLED = {"unsafe_called_safe": UNSAFE, "safe_called_unsafe": SAFE}
 
 
 def _labels(out: Evaluation, episodes: Episodes) -> None:
@@ -110,7 +104,7 @@ def _labels(out: Evaluation, episodes: Episodes) -> None:
         labelled, wrong = (episodes.region == code) & episodes.alive, inside if code == UNSAFE else ~inside
         label, n = "U" if code == UNSAFE else "S", int(labelled.sum())
         events, shown = (labelled & wrong).any(0), labelled.any(0)
-        out.add(share(name, int(events.sum()), int(shown.sum()), f"episodes with an observation of {label}"))
+        out.count(name, events, f"episodes with an observation of {label}", shown)
         value = float((labelled & wrong).sum()) / n if n else None
         out.add(Measurement(f"{name}_of_frames", value, "share", n, note=f"observations of {label}, not independent"))
 
@@ -120,17 +114,14 @@ def _from_the_set(out: Evaluation, own: Episodes, touches: torch.Tensor) -> None
     starts, leaves = own.barrier[0] <= 0, ((own.barrier > 0) & own.alive).any(0)
     longest = int(own.alive.sum(0).max()) - 1  # the environment may end them before the horizon
     note = f"episodes of at most {longest} steps from B <= 0 under the policy"
-    out.add(share("starts_inside", int(starts.sum()), len(starts), "resets with B <= 0"))
-    out.add(share("touch_unsafe", int((touches & starts).sum()), int(starts.sum()), note))
-    out.add(share("leave", int((leaves & starts).sum()), int(starts.sum()), note))
+    out.count("starts_inside", starts, "resets with B <= 0")
+    out.count("touch_unsafe", touches & starts, note, starts)
+    out.count("leave", leaves & starts, note, starts)
 
 
 def logged(evaluation: Evaluation) -> dict[str, Any]:
     """The figures of an evaluation that are logged, under their documented names."""
-    names = ("unsafe_called_safe", "safe_called_unsafe", "starts_inside", "touch_unsafe", "leave", "random_touch_unsafe")
+    names = (*_CALLED, "starts_inside", "touch_unsafe", "leave", "random_touch_unsafe")
     # A fixed set of names: what was not seen is not a number.
     values = {f"eval_{n}": evaluation[n] for n in names}
     return {name: float("nan") if value is None else value for name, value in values.items()}
-
-
-__all__ = ["evaluate_episodes", "logged", "separating_level"]

@@ -25,40 +25,27 @@ from torchrl_sspl.viability.grid import ViabilityKernel, recoverable_set, viabil
 
 @torch.no_grad()
 def encode_states(agent: Agent, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None) -> Tensor:
-    """Latents of true states, seen through two frames, in chunks that fit the memory.
+    """Latents ``(n, p)`` of true states ``(n, state_dim)``, seen through two frames. Source: none.
 
     Args:
         agent: frozen agent.
         env: gives the state one step earlier, and the pictures.
         state: ``(n, state_dim)``.
         draw: states ``(n, state_dim)`` -> frames ``(n, 3, H, W)`` uint8; default ``env.draw``.
-
-    Returns:
-        ``(n, p)`` latents.
-
-    Source: none.
     """
     agent, draw = hosted(agent), draw or env.draw
     if not len(state):
         return torch.zeros(0, agent.latent_dim)
-    return torch.cat(
-        [agent.encode(torch.cat([draw(env.previous_state(x)), draw(x)], dim=-3)) for x in state.split(CHUNK)]
-    )
+    parts = state.split(CHUNK)
+    return torch.cat([agent.encode(torch.cat([draw(env.previous_state(x)), draw(x)], dim=-3)) for x in parts])
 
 
 def barrier_of(acts: Any, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None) -> Tensor | None:
-    """Barrier values of true states, of anything that acts.
+    """Barrier values ``(n,)`` of true states, of anything that acts; None without a barrier. Source: none.
 
     Args:
         acts: see ``as_controller``; its memory is reset.
-        env: gives the pictures.
-        state: ``(n, state_dim)``.
-        draw: states -> frames; default ``env.draw``.
-
-    Returns:
-        ``(n,)``; None without a barrier.
-
-    Source: none.
+        env, state, draw: as for :func:`encode_states`.
     """
     acts = as_controller(acts)
     if isinstance(acts, AgentController):
@@ -78,7 +65,7 @@ def barrier_of(acts: Any, env: SafetyEnv, state: Tensor, *, draw: Draw | None = 
 def states_where(
     keep: Callable[[Tensor], Tensor], space: Region, n: int, generator: torch.Generator, draws: int = 60
 ) -> Tensor:
-    """Up to n states of a region for which a condition holds, uniformly, by rejection.
+    """Up to n states of a region for which a condition holds, uniformly, by rejection. Source: none.
 
     Args:
         keep: states ``(k, state_dim)`` -> bool ``(k,)``.
@@ -86,11 +73,6 @@ def states_where(
         n: how many are wanted.
         generator: of the draws.
         draws: how often at least 2000 are drawn at most.
-
-    Returns:
-        ``(at most n, state_dim)``.
-
-    Source: none.
 
     Example:
         >>> from torchrl_sspl.sets import Box
@@ -155,7 +137,10 @@ def evaluate(
     grid: int | None = None,
     progress: bool = False,
 ) -> Evaluation:
-    r"""Measures an agent, or anything else that acts, on fresh data against the true system.
+    """Measures an agent, or anything else that acts, on fresh data against the true system.
+
+    Measured are sets on a grid, one-step errors, episodes, Lipschitz constants, latency. Source: paper Section V shows
+    figures only; the measurements are this library's.
 
     Args:
         agent: frozen agent, or what ``as_controller`` takes: a bare policy, a policy of another library. What needs a
@@ -165,14 +150,8 @@ def evaluate(
         kernel: true viability kernel of the twin; computed if not given.
         draw: states -> frames ``(n, 3, H, W)`` uint8; default ``env.draw``. Another renderer measures how the agent
             does on foreign frames.
-        episodes: number of episodes, in place of the configuration's.
-        grid: states per dimension of the state grid, in place of the configuration's.
+        episodes, grid: number of episodes, states per dimension of the state grid, in place of the configuration's.
         progress: show progress bars.
-
-    Returns:
-        The measurements: sets on a grid, one-step errors, episodes, Lipschitz constants, latency.
-
-    Source: paper Section V shows figures only; the measurements are this library's.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
@@ -190,14 +169,17 @@ def evaluate(
     safe_barrier = _sets(run)
     if known is not None:
         _lipschitz(run, known)
-        _random_errors(run, known)
+        seen = twin.sample_states(5000, generator=generator)
+        action = (2 * torch.rand(len(seen), twin.action_dim, generator=generator) - 1) * twin.max_action
+        error = _step_errors(run, known, seen, action)
+        quantiles(run.out, "random_action_error", error, "latent", "uniform states and actions")
         _margins(run, known, safe_barrier)
     _from_the_set(run)
     _from_unsafe(run)
     start = twin.sample_states(max(1, n // 5), generator=generator, region=twin.safe_set)
     touched = twin.unsafe_set.contains(run.episodes(start, "S").states).any(0)
     note = f"episodes of {config.horizon} steps from S"
-    run.out.add(share("labelled_safe_rollouts_touch_unsafe", int(touched.sum()), len(start), note))
+    run.out.count("labelled_safe_rollouts_touch_unsafe", touched, note)
     run.out.add(latency(acts, twin))
     return run.out
 
@@ -219,18 +201,18 @@ def _sets(run: _Run) -> Tensor | None:
     member, doomed = barrier <= 0, ~unsafe & ~viable
     on_grid = f"{sizes} states per dimension" if isinstance(sizes, int) else f"{_times(sizes)} states"
     for name, events, of, note in (
-        (names[1], safe_barrier > 0, safe_barrier >= -math.inf, "uniform samples of S"),
+        (names[1], safe_barrier > 0, None, "uniform samples of S"),
         (names[2], member & viable, viable, f"true kernel, {on_grid}"),
         (names[3], member & ~viable, member, f"{{B<=0}} outside the true kernel, {on_grid}"),
         (names[4], member & doomed, doomed, f"states outside U and the kernel, {on_grid}"),
     ):
-        out.add(share(name, int(events.sum()), int(of.sum()), note))
+        out.count(name, events, note, of)
     note = "q1: largest B on S"
     out.add(Measurement("worst_safe_barrier", float(safe_barrier.max()), "barrier", len(safe_barrier), note=note))
     out.add(Measurement("barrier_depth", float(-barrier.min()), "barrier", note="|min B| on the grid"))
     out.arrays.update(barrier=barrier, **({} if latent is None else {"latent": latent}))
     in_unsafe, note = _unsafe_barrier(run, barrier[unsafe], on_grid)
-    out.add(share("unsafe_called_safe", int((in_unsafe <= 0).sum()), len(in_unsafe), note))
+    out.count("unsafe_called_safe", in_unsafe <= 0, note)
     worst = float(-in_unsafe.min())
     out.add(Measurement("worst_unsafe_barrier", worst, "barrier", len(in_unsafe), note="q2: largest -B on U"))
     return safe_barrier
@@ -253,8 +235,7 @@ def _unsafe_barrier(run: _Run, on_state_grid: Tensor, on_grid: str) -> tuple[Ten
         for a, b, k, turn in zip(bounds.low, bounds.high, sizes, turns, strict=True)
     ]
     states = torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
-    value = run.barrier(states[env.unsafe_set.contains(states)])
-    assert value is not None
+    value: Any = run.barrier(states[env.unsafe_set.contains(states)])
     return value, f"grid of {_times(sizes)} states over U"
 
 
@@ -266,51 +247,38 @@ def _lipschitz(run: _Run, agent: Agent) -> None:
     add(Measurement("lipschitz_ratio", lower / bound, "ratio", note="sampled over certified"))
 
 
-def _random_errors(run: _Run, agent: Agent) -> None:
-    """Errors of the latent dynamics on single steps under random actions."""
-    env = run.env
-    start = env.sample_states(5000, generator=run.generator)
-    action = (2 * torch.rand(len(start), env.action_dim, generator=run.generator) - 1) * env.max_action
-    eyes, camera = AgentController(agent), Camera(run.draw or env.draw, start, env.previous_state(start))
-    z = eyes.watch(camera).latent
-    camera.move(env.wrap(env.dynamics(start, action)))
-    error = (agent.dynamics(z, action) - eyes.watch(camera).latent).norm(dim=-1)
-    quantiles(run.out, "random_action_error", error, "latent", "uniform states and actions")
-
-
-def _margins(run: _Run, agent: Agent, safe_barrier: Tensor | None) -> None:
+def _margins(run: _Run, agent: Agent, safe_barrier: Any) -> None:
     """The paper's margins, and how far the conditions hold with them."""
     env, out, latent, barrier = run.env, run.out, run.out.arrays["latent"], run.out.arrays["barrier"]
-    assert safe_barrier is not None
     fresh = encode_states(agent, env, env.sample_states(5000, generator=run.generator), draw=run.draw)
     nearest = torch.cat([torch.cdist(part, latent).amin(1) for part in fresh.split(CHUNK)])
-    note = f"fresh latents to the nearest of {len(latent)} latents of the grid; not a covering radius of all observations"
-    quantiles(out, "covering_radius", nearest, "latent", note)
-    error = _held_out_error(run, agent)
+    note = f"fresh latents to the nearest of {len(latent)} latents of the grid"
+    quantiles(out, "covering_radius", nearest, "latent", f"{note}; not a covering radius of all observations")
+    error = _step_errors(run, agent, states_where(run.inside, env.state_space, 5000, run.generator))
     psi = functional.safety_margin(agent.lipschitz_bound, float(nearest.max()), mode="paper").q1
     eta = functional.dynamics_margin(agent.lipschitz_bound, float(error.max()) if len(error) else math.nan)
     out.add(Measurement("safety_margin", psi, "barrier", len(fresh), note="psi* = L_B eps-bar"))
-    out.add(Measurement("dynamics_margin", eta, "barrier", len(error), note="eta* = L_B delta, held-out steps of the policy"))
+    note = "eta* = L_B delta, held-out steps of the policy"
+    out.add(Measurement("dynamics_margin", eta, "barrier", len(error), note=note))
     q3 = agent.barrier(agent.dynamics(latent, agent.policy(latent)))[:, 0][barrier <= 0]
     for name, met, what in (
         ("q1_with_margin", safe_barrier + psi <= 0, "B + psi* <= 0 on S"),
         ("q2_with_margin", barrier[out.arrays["unsafe"]] - psi >= 0, "B - psi* >= 0 on U"),
         ("q3_with_margin", q3 + psi + eta <= 0, "B(d(z, pi(z))) + psi* + eta* <= 0 on {B<=0}"),
     ):
-        out.add(share(name, int(met.sum()), len(met), what))
+        out.count(name, met, what)
 
 
-def _held_out_error(run: _Run, agent: Agent) -> Tensor:
-    """Errors of the latent dynamics on single steps of the policy from the set, ``(n,)``."""
+def _step_errors(run: _Run, agent: Agent, start: Tensor, action: Tensor | None = None) -> Tensor:
+    """Errors ``(n,)`` of the latent dynamics on single steps under given actions, or those of the policy."""
     env = run.env
-    start = states_where(run.inside, env.state_space, 5000, run.generator)
     if not len(start):
         return torch.zeros(0)
     eyes, camera = AgentController(agent), Camera(run.draw or env.draw, start, env.previous_state(start))
-    first = eyes.step(camera)
-    assert first.action is not None
-    camera.move(env.wrap(env.dynamics(start, first.action)))
-    return (first.predicted - eyes.watch(camera).latent).norm(dim=-1)  # type: ignore[operator]
+    latent = eyes.watch(camera).latent
+    action = agent.policy(latent) if action is None else action
+    camera.move(env.wrap(env.dynamics(start, action)))
+    return (agent.dynamics(latent, action) - eyes.watch(camera).latent).norm(dim=-1)
 
 
 def _from_the_set(run: _Run) -> None:
@@ -327,8 +295,8 @@ def _from_the_set(run: _Run) -> None:
     found = run.episodes(start, "{B<=0}")
     barrier = found.barrier
     touched, left = env.unsafe_set.contains(found.states).any(0), (barrier > 0).any(0)
-    out.add(share("safe_rollouts_touch_unsafe", int(touched.sum()), len(start), note))
-    out.add(share("safe_rollouts_leave", int(left.sum()), len(start), note))
+    out.count("safe_rollouts_touch_unsafe", touched, note)
+    out.count("safe_rollouts_leave", left, note)
     error, barrier_error = found.prediction_error, found.barrier_error
     if error is not None and barrier_error is not None:
         quantiles(out, "on_policy_error", error.amax(0), "latent", "largest error of an episode")
@@ -345,36 +313,36 @@ def _from_unsafe(run: _Run) -> None:
     """Episodes from U, where a return is possible at all."""
     env, out = run.env, run.out
     recoverable = recoverable_set(env, run.kernel)
-    start = states_where(
-        lambda x: env.unsafe_set.contains(x) & recoverable.contains(x), env.state_space, max(1, run.n // 5), run.generator
-    )
+
+    def keep(state: Tensor) -> Tensor:
+        return env.unsafe_set.contains(state) & recoverable.contains(state)
+
+    start = states_where(keep, env.state_space, max(1, run.n // 5), run.generator)
     name, note = "unsafe_rollouts_return", "recoverable starts in U that end in {B<=0} and outside U"
     if not len(start):
         out.add(share(name, 0, 0, note))
         return
     found = run.episodes(start, "U")
     if found.barrier is None:
-        home, note = run.kernel.contains(found.states[-1]), "recoverable starts in U that end in the true kernel (no barrier)"
+        home = run.kernel.contains(found.states[-1])
+        note = "recoverable starts in U that end in the true kernel (no barrier)"
     else:
         home = found.barrier[-1] <= 0
         out.arrays.update(recovery_traces=found.barrier[:, :32])
     back = home & ~env.unsafe_set.contains(found.states[-1])
-    out.add(share(name, int(back.sum()), len(start), note))
+    out.count(name, back, note)
     out.arrays.update(recovery=found.states[:, :32], recovery_actions=found.actions[:, :32])
 
 
 def latency(acts: Any, env: SafetyEnv, frames: int = 400) -> Measurement:
-    """Time from an observation to the action (and the barrier value), one after the other.
+    """99th percentile of the time in ms from an observation to the action (and the barrier value), one after the other.
+
+    Source: none.
 
     Args:
         acts: see ``as_controller``; of an agent two frames to action and barrier value.
         env: gives the pictures.
         frames: how many.
-
-    Returns:
-        The 99th percentile in ms.
-
-    Source: none.
     """
     acts = as_controller(acts)
     state = env.sample_states(20, torch.Generator().manual_seed(0))
@@ -390,6 +358,3 @@ def latency(acts: Any, env: SafetyEnv, frames: int = 400) -> Measurement:
     value = 1e3 * ordered[math.ceil(0.99 * frames) - 1]
     what = "encoder, policy and barrier" if isinstance(acts, AgentController) else "whatever it does"
     return Measurement("latency_p99", value, "ms", frames, note=f"{torch.get_num_threads()} thread(s), {what}")
-
-
-__all__ = ["barrier_of", "encode_states", "evaluate", "latency", "states_where"]

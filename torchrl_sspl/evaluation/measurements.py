@@ -8,52 +8,34 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from torch import Tensor
+from torchrl.envs import EnvBase
 
 from torchrl_sspl.certification.statistics import clopper_pearson
 
-CONFIDENCE = 0.95
+_CONFIDENCE = 0.95
 
 Draw = Callable[[Tensor], Tensor]
+MakeEnv = Callable[..., EnvBase]
 
 
 @dataclass
 class Measurement:
-    """One figure of an evaluation.
+    """One figure of an evaluation."""
 
-    Attributes:
-        name: what was measured.
-        value: the figure; None: not measured.
-        unit: "share", "latent", "barrier", ...
-        n: sample size (None: not a sample).
-        events: number of events among the n (shares only).
-        lower: lower end of the two-sided 95 % Clopper-Pearson interval (shares only).
-        upper: upper end of it; with no event, the one-sided 95 % bound.
-        note: how it was measured.
-    """
-
-    name: str
-    value: float | None
-    unit: str
-    n: int | None = None
-    events: int | None = None
-    lower: float | None = None
-    upper: float | None = None
-    note: str = ""
+    name: str  # what was measured
+    value: float | None  # None: not measured
+    unit: str  # "share", "latent", "barrier", ...
+    n: int | None = None  # sample size; None: not a sample
+    events: int | None = None  # among the n, of shares only, as what follows
+    lower: float | None = None  # end of the two-sided 95 % Clopper-Pearson interval
+    upper: float | None = None  # the other; with no event, the one-sided 95 % bound
+    note: str = ""  # how it was measured
 
 
 def share(name: str, events: int, n: int, note: str = "") -> Measurement:
-    """Measurement of a share with its exact confidence bounds.
+    """Measurement of a share, events of n independent trials, with its exact confidence bounds.
 
-    Args:
-        name: what was measured.
-        events: number of events.
-        n: number of independent trials.
-        note: how it was measured.
-
-    Returns:
-        The measurement; value and bounds are None when there was no trial.
-
-    Source: Clopper and Pearson (1934).
+    Value and bounds are None when there was no trial. Source: Clopper and Pearson (1934).
 
     Example:
         >>> round(share("leaves", 0, 3000).upper, 4)
@@ -61,18 +43,13 @@ def share(name: str, events: int, n: int, note: str = "") -> Measurement:
     """
     if n == 0:
         return Measurement(name, None, "share", 0, 0, None, None, note)
-    lower, upper = clopper_pearson(events, n, confidence=CONFIDENCE)
+    lower, upper = clopper_pearson(events, n, confidence=_CONFIDENCE)
     return Measurement(name, events / n, "share", n, events, lower, upper, note)
 
 
 @dataclass
 class Evaluation:
-    """All measurements of one agent, and what is needed to draw them.
-
-    Attributes:
-        measurements: by name.
-        arrays: tensors for figures (grid values, trajectories); not written to ``metrics.json``.
-    """
+    """All measurements of one agent by name, and ``arrays``: tensors for figures, not written to ``metrics.json``."""
 
     measurements: dict[str, Measurement] = field(default_factory=dict)
     arrays: dict[str, Any] = field(default_factory=dict)
@@ -80,6 +57,10 @@ class Evaluation:
     def add(self, measurement: Measurement) -> None:
         """Keep a measurement under its name."""
         self.measurements[measurement.name] = measurement
+
+    def count(self, name: str, events: Tensor, note: str, of: Tensor | None = None) -> None:
+        """Keep the share of events ``(n,)`` bool in the trials, or in some of them, which hold all events."""
+        self.add(share(name, int(events.sum()), len(events) if of is None else int(of.sum()), note))
 
     def missing(self, *names: str, unit: str = "share", note: str = "no barrier") -> None:
         """Names of what could not be measured, and why."""
@@ -95,16 +76,9 @@ class Evaluation:
 
 
 def quantiles(out: Evaluation, name: str, values: Tensor | None, unit: str, note: str) -> None:
-    """Adds mean, 99 %, 99.9 % and maximum of a sample, as measurements of their own.
+    """Adds 99 %, 99.9 %, mean and maximum of a sample ``(n,)`` as ``<name>_q99``, ``_q999``, ``_mean`` and ``_max``.
 
-    Args:
-        out: what they are added to.
-        name: what was measured; the four are called ``<name>_q99``, ``_q999``, ``_mean`` and ``_max``.
-        values: ``(n,)`` the sample; of None or none, the four are not measured.
-        unit: of the values.
-        note: how it was measured.
-
-    Source: none.
+    Of a sample that is None or empty, the four are not measured. Source: none.
 
     Example:
         >>> import torch
@@ -117,11 +91,7 @@ def quantiles(out: Evaluation, name: str, values: Tensor | None, unit: str, note
         out.missing(*(f"{name}_{label}" for label in ("q99", "q999", "mean", "max")), unit=unit, note=note)
         return
     ordered = values.double().sort().values
-    for label, q in (("q99", 0.99), ("q999", 0.999)):
-        rank = min(len(ordered) - 1, math.ceil(q * len(ordered)) - 1)
-        out.add(Measurement(f"{name}_{label}", float(ordered[rank]), unit, len(values), note=note))
-    out.add(Measurement(f"{name}_mean", float(ordered.mean()), unit, len(values), note=note))
-    out.add(Measurement(f"{name}_max", float(ordered[-1]), unit, len(values), note=note))
-
-
-__all__ = ["CONFIDENCE", "Draw", "Evaluation", "Measurement", "quantiles", "share"]
+    n = len(ordered)
+    q99, q999 = (ordered[min(n - 1, math.ceil(q * n) - 1)] for q in (0.99, 0.999))
+    for label, value in (("q99", q99), ("q999", q999), ("mean", ordered.mean()), ("max", ordered[-1])):
+        out.add(Measurement(f"{name}_{label}", float(value), unit, n, note=note))

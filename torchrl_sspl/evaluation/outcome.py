@@ -127,19 +127,11 @@ def _value(m: Measurement | None, bound: float | None) -> str:
 
 
 def write_metrics(outcome: Outcome) -> Path:
-    """Write ``metrics.json``, and the same beside an agent just trained.
+    """Write ``metrics.json``, and the same beside an agent just trained; returns the file. Source: none.
 
     Measurements (by evaluation, then by name), requirements and verdicts, checks, budget, warnings and configuration.
-
-    No path of this machine is written: of the configuration, ``out_dir`` is left out, and of paths only the last part stays.
-
-    Args:
-        outcome: of the run.
-
-    Returns:
-        The file.
-
-    Source: none.
+    No path of this machine is written: of the configuration, ``out_dir`` is left out, and of paths only the last part
+    stays.
     """
     from torchrl_sspl import __version__
 
@@ -181,6 +173,3 @@ def _without_paths(value: Any) -> Any:
     if isinstance(value, Path) or (isinstance(value, str) and Path(value).is_absolute()):
         return Path(value).name
     return value
-
-
-__all__ = ["EVALUATION_FILE", "METRICS_FILE", "Outcome", "write_metrics"]

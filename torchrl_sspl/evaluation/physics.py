@@ -15,8 +15,8 @@ from torchrl_sspl.evaluation.known import barrier_of
 from torchrl_sspl.evaluation.measurements import Evaluation, share
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 
-_FROM_SAFE = ("walks_from_safe_hit", "walks_from_safe_fall")
-_FROM_SET = ("walks_from_set_enter", "walks_from_set_hit", "walks_from_set_fall")
+_FROM_SET = {"walks_from_set_enter": "entered", "walks_from_set_hit": "hit", "walks_from_set_fall": "fallen"}
+_FROM_SAFE = {"walks_from_safe_hit": "hit", "walks_from_safe_fall": "fallen"}
 
 
 def evaluate_physics(
@@ -26,14 +26,14 @@ def evaluate_physics(
 
     Args:
         agent: frozen agent, or what ``as_controller`` takes. Without a barrier no episode starts in {B <= 0}.
-        env: the system; ``env.physics()`` makes its world, ``env.known_twin()`` gives S, U, and the frames in which starts
-            inside {B <= 0} are looked for.
+        env: the system; ``env.physics()`` makes its world, ``env.known_twin()`` gives S, U, and the frames in which
+            starts inside {B <= 0} are looked for.
         config: number (``walks``), length and seed of the episodes.
         progress: show progress bars.
 
     Returns:
-        Measurements (shares of episodes with exact bounds; in ``arrays["walks"]`` all episodes, first the closest call, with
-        its frames), and the episodes: those from S, then those from {B <= 0} where there are any.
+        Measurements (shares of episodes with exact bounds; in ``arrays["walks"]`` all episodes, first the closest call,
+        with its frames), and the episodes: those from S, then those from {B <= 0} where there are any.
 
     Raises:
         ConfigError: the system has no full physics.
@@ -58,52 +58,21 @@ def evaluate_physics(
         finally:
             world.close()
     length = f"walks of at most {config.walk_seconds:g} s from"
-    events = [dict.fromkeys(("hit", "entered", "fallen"), 0)] * 2
-    for k, group in enumerate(groups):
-        hit = group.events["hit"] | group.events["entered"] if k == 0 else group.events["hit"]
-        events[k] = {"hit": int(hit.sum())} | {name: int(group.events[name].sum()) for name in ("entered", "fallen")}
-    first, second = (len(start) for _, start in starts)
-    for name, event in zip(_FROM_SAFE, ("hit", "fallen"), strict=True):
-        out.add(share(name, events[0][event], first, f"{length} S, heading uniform"))
-    for name, event in zip(_FROM_SET, ("entered", "hit", "fallen"), strict=True):
-        out.add(share(name, events[1][event], second, f"{length} {{B <= 0}} outside U"))
+    for k, (names, where) in enumerate(((_FROM_SAFE, "S, heading uniform"), (_FROM_SET, "{B <= 0} outside U"))):
+        for name, event in names.items():
+            happened = groups[k].events[event] if k < len(groups) else torch.zeros(0)
+            if name == "walks_from_safe_hit" and groups:
+                happened = happened | groups[k].events["entered"]
+            out.add(share(name, int(happened.sum()), len(starts[k][1]), f"{length} {where}"))
     return out, groups
-
-
-def filmed_episode(
-    agent: Any, env: SafetyEnv, start: Tensor, config: EvaluationConfig | None = None, *, seed: int = 0
-) -> Episodes:
-    """One episode in the full physics of a system, with its frames.
-
-    Args:
-        agent: see :func:`evaluate_physics`.
-        env: the system; ``env.physics()`` makes its world.
-        start: ``(s,)`` the pose in which it starts.
-        config: length of the episode.
-        seed: of what the world draws at the start.
-
-    Returns:
-        The episode.
-
-    Raises:
-        ConfigError: the system has no full physics.
-        MissingDependencyError: the simulator is not installed.
-
-    Source: none.
-    """
-    world = _world(env)
-    try:
-        steps = _steps(env, config or EvaluationConfig())
-        return simulate(agent, world, start=torch.as_tensor(start)[None], horizon=steps, seed=seed, film=1)
-    finally:
-        world.close()
 
 
 def _world(env: SafetyEnv) -> Any:
     make = env.physics()
     if make is None:
         raise ConfigError(
-            f"physics: expected a system with a full physics, received {type(env).__name__}, which has none; override physics()"
+            f"physics: expected a system with a full physics, received {type(env).__name__}, which has none; override "
+            "physics()"
         )
     return make()
 
@@ -113,7 +82,7 @@ def _steps(env: SafetyEnv, config: EvaluationConfig) -> int:
 
 
 def _closest_on_film(acts: Controller, world: Any, groups: list[Episodes], options: dict[str, Any]) -> Episodes:
-    """All episodes; first the one whose barrier came highest (without a barrier just the first), once more and filmed."""
+    """All episodes; first the one whose barrier came highest (the very first without one), once more and filmed."""
     every, lengths = groups[0].joined(*groups[1:]), [len(group) for group in groups]
     chosen = 0
     if every.barrier is not None:
@@ -138,6 +107,3 @@ def _starts_inside(acts: Controller, twin: SafetyEnv, n: int, generator: torch.G
         if len(found) >= n:
             break
     return found[:n]
-
-
-__all__ = ["evaluate_physics", "filmed_episode"]

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.evaluation.controllers import CHUNK, Camera, Controller, Decision, as_controller
+from torchrl_sspl.evaluation.controllers import _NONE, CHUNK, Camera, Controller, Decision, as_controller
 from torchrl_sspl.evaluation.measurements import Draw
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
@@ -22,7 +22,7 @@ EVENTS = {"entered": "unsafe", "hit": "contact", "fallen": "fallen", "left": "le
 
 @dataclass
 class Episodes:
-    """Episodes side by side, time first; what lies behind an episode's end is not ``alive``, and its values mean nothing.
+    """Episodes side by side, time first; behind an episode's end nothing is ``alive``, and values mean nothing.
 
     Attributes:
         actions: ``(T, n, m)``.
@@ -40,12 +40,12 @@ class Episodes:
     actions: Tensor
     region: Tensor
     alive: Tensor
-    states: Tensor = None  # type: ignore[assignment]
-    barrier: Tensor = None  # type: ignore[assignment]
-    latent: Tensor = None  # type: ignore[assignment]
-    prediction_error: Tensor = None  # type: ignore[assignment]
-    barrier_error: Tensor = None  # type: ignore[assignment]
-    frames: Tensor = None  # type: ignore[assignment]
+    states: Tensor = _NONE
+    barrier: Tensor = _NONE
+    latent: Tensor = _NONE
+    prediction_error: Tensor = _NONE
+    barrier_error: Tensor = _NONE
+    frames: Tensor = _NONE
     events: dict[str, Tensor] = field(default_factory=dict)
 
     def __len__(self) -> int:
@@ -95,8 +95,9 @@ def simulate(
 
     From given states of a system with known dynamics, all episodes run side by side, on its dynamics and pictures; who
     leaves its state space stands still from then on where this counts as safe (barrier value -1, no error: nothing is
-    asked of it any more), and goes on where it counts as unsafe. Any other TorchRL environment runs from its own resets.
-    A world of gymnasium (full physics) runs one episode after the other, from its own resets or from given poses.
+    asked of it any more), and goes on where it counts as unsafe. Any other TorchRL environment runs from its own
+    resets. A world of gymnasium (full physics) runs one episode after the other, from its own resets or from given
+    poses. Source: paper Section V (trajectories from the learned policy).
 
     Args:
         controller: what acts, see ``as_controller``.
@@ -105,30 +106,26 @@ def simulate(
         horizon: longest episode, in steps.
         start: ``(n, s)`` first states, or poses for ``reset(options={"pose": ...})``.
         episodes: how many from the environment's own resets.
-        seed: of the resets; in a gymnasium environment of the first, the others count on. Default: as the environment is.
+        seed: of the resets; in a gymnasium environment of the first, the others count on. Default: as the environment
+            is.
         draw: states -> frames uint8 ``(n, 3, H, W)`` in place of ``env.draw``.
         film: of how many episodes the frames are kept.
         label: title of a progress bar; none without.
 
-    Returns:
-        The episodes.
-
     Raises:
         ConfigError: if it is not clear what to run, or the controller reads what the environment does not show.
 
-    Source: paper Section V (trajectories from the learned policy).
-
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
-        >>> falls = simulate(lambda pixels: torch.zeros(len(pixels)), PendulumEnv(), start=torch.tensor([[0.1, 0.0]]), horizon=3)
+        >>> falls = simulate(lambda pixels: torch.zeros(len(pixels)), PendulumEnv(), start=torch.zeros(1, 2), horizon=3)
         >>> falls.actions.shape, falls.states.shape, falls.barrier
         (torch.Size([3, 1, 1]), torch.Size([4, 1, 2]), None)
     """
     acts = as_controller(controller)
     if horizon < 1 or (start is None and (episodes is None or episodes < 1)):
         raise ConfigError(
-            f"simulate: expected horizon >= 1, and start or episodes >= 1, received horizon={horizon}, episodes={episodes} "
-            "and no start"
+            f"simulate: expected horizon >= 1, and start or episodes >= 1, received horizon={horizon}, "
+            f"episodes={episodes} and no start"
         )
     if start is not None and hasattr(env, "dynamics"):
         return _from_states(acts, env, start, horizon, draw or env.draw, film, label)
@@ -196,7 +193,9 @@ def _from_states(
         found = [_from_states(acts, env, x, horizon, draw, film - k * CHUNK, label) for k, x in enumerate(parts)]
         return found[0].joined(*found[1:])
     if acts.reads not in ("pixels", "state"):
-        raise ConfigError(f"controller.reads: expected 'pixels' or 'state' on {type(env).__name__}, received '{acts.reads}'")
+        raise ConfigError(
+            f"controller.reads: expected 'pixels' or 'state' on {type(env).__name__}, received '{acts.reads}'"
+        )
     camera = Camera(draw, start, env.previous_state(start))
 
     def shown() -> Any:
@@ -212,7 +211,6 @@ def _from_states(
     record.add(states=state, frames=draw(state[:film]) if film > 0 else None)
     record.judge(decision, env.region(state)[:, 0], alive)
     for t in tqdm(range(horizon), desc=label, disable=label is None, leave=False):
-        assert decision.action is not None
         ask, before, last, gone = _asked(acts, t == horizon - 1), decision, state, None
         state = env.wrap(env.dynamics(state, decision.action))
         if exit_is_safe:
@@ -265,7 +263,6 @@ def _one_batch(acts: Controller, env: EnvBase, k: int, horizon: int, film: int) 
     decision = acts.step(shown(data))
     keep(data, decision)
     for t in range(horizon):
-        assert decision.action is not None
         before = decision
         stepped, data = env.step_and_maybe_reset(data.set("action", decision.action.to(env.device)))
         following = stepped["next"]
@@ -285,7 +282,9 @@ def _one_batch(acts: Controller, env: EnvBase, k: int, horizon: int, film: int) 
     return record.episodes(horizon, {})
 
 
-def _in_world(acts: Controller, env: Any, pose: Iterable[float] | None, horizon: int, seed: int | None, film: bool) -> Episodes:
+def _in_world(
+    acts: Controller, env: Any, pose: Iterable[float] | None, horizon: int, seed: int | None, film: bool
+) -> Episodes:
     """One episode in a gymnasium environment, up to the first of: steps are over, it terminates, falls, or leaves."""
     record, alive = _Record(), torch.ones(1, dtype=torch.bool)
     events = dict.fromkeys(EVENTS, False)
@@ -300,12 +299,12 @@ def _in_world(acts: Controller, env: Any, pose: Iterable[float] | None, horizon:
         record.judge(decision, torch.tensor([code]), alive)
 
     acts.reset()
-    observation, info = env.reset(seed=seed, **({} if pose is None else {"options": {"pose": [float(v) for v in pose]}}))
+    options = {} if pose is None else {"options": {"pose": [float(v) for v in pose]}}
+    observation, info = env.reset(seed=seed, **options)
     decision = acts.step(shown(observation, info))
     keep(observation, info, decision)
     events["entered"] = bool(info.get("unsafe"))
     for t in range(horizon):
-        assert decision.action is not None
         before = decision
         observation, _, terminated, truncated, info = env.step(decision.action[0].numpy())
         events = {name: seen or bool(info.get(EVENTS[name])) for name, seen in events.items()}
@@ -318,6 +317,3 @@ def _in_world(acts: Controller, env: Any, pose: Iterable[float] | None, horizon:
             break
     told = {name: torch.tensor([seen]) for name, seen in events.items() if EVENTS[name] in info}
     return record.episodes(horizon, told)
-
-
-__all__ = ["EVENTS", "Episodes", "simulate"]
