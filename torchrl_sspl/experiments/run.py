@@ -66,8 +66,8 @@ def agent_phases(config: Config, *, known: bool) -> list[Phase]:
         return []  # as printed
     phases = synthesis_phases(s, check=CheckRound if known else None) if s.enabled else []
     if e.calibrate and not known:
-        level = {"episodes": e.episodes, "horizon": e.horizon, "envs": e.envs, "progress": config.trainer.progress}
-        phases.append(PlaceLevel(s.rounds - 1 if s.enabled else 0, **level))
+        number, progress = s.rounds - 1 if s.enabled else 0, config.trainer.progress
+        phases.append(PlaceLevel(number, episodes=e.episodes, horizon=e.horizon, envs=e.envs, progress=progress))
     return phases
 
 
