@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import itertools
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -43,20 +44,13 @@ def animate(
         fps: pictures per second.
         title: what is shown.
 
-    Returns:
-        The file written. Without ``imageio-ffmpeg`` a film that was to be an mp4 becomes a gif, with a warning.
-
-    Raises:
-        ShapeError, NonFiniteError, ConfigError: an argument or the file name is not what was expected.
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Section V, figures "sspl_pend" and "traj_sspl_gr"; deviation: they move, and B is shown.
+    Returns the file written: without ``imageio-ffmpeg`` an mp4 becomes a gif, with a warning. Raises ShapeError,
+    NonFiniteError or ConfigError for another argument or file name. Source: paper Section V, figures "sspl_pend" and
+    "traj_sspl_gr"; deviation: they move, and B is shown.
 
     Example:
-        >>> import tempfile
         >>> plane, pictures = Plane(("x", "v"), [-1, -1], [1, 1]), torch.zeros(3, 3, 8, 8, dtype=torch.uint8)
-        >>> film = tempfile.mkdtemp() + "/film.gif"
-        >>> animate(torch.zeros(3, 2), pictures, torch.zeros(3), torch.zeros(2, 1), film, plane=plane).name
+        >>> animate(torch.zeros(3, 2), pictures, torch.zeros(3), torch.zeros(2, 1), "film.gif", plane=plane).name
         'film.gif'
     """
     path = Path(path)
@@ -78,12 +72,9 @@ def animate(
 
 
 def _images(
-    episode: tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray],
-    plane: Plane,
-    background: tuple[Any, Any] | None,
-    action_name: str,
-    title: str,
-) -> Iterator[np.ndarray]:
+    episode: tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray], plane: Plane,
+    background: tuple[Any, Any] | None, action_name: str, title: str,
+) -> Iterator[np.ndarray]:  # fmt: skip
     """RGB pictures of the film; what does not move is drawn once."""
     points, pictures, barrier, actions = episode
     values = actions if barrier is None else barrier
@@ -135,20 +126,13 @@ def _images(
 def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
     ffmpeg = require("imageio_ffmpeg")
     first = next(images)
-    writer = ffmpeg.write_frames(
-        str(path),
-        (first.shape[1], first.shape[0]),
-        fps=fps,
-        codec="libx264",
-        quality=None,
-        macro_block_size=2,
-        # Small, and ready to play before it is read to the end.
-        output_params=["-crf", "24", "-preset", "medium", "-movflags", "+faststart", "-threads", "1"],
-    )
+    # Small, and ready to play before it is read to the end.
+    output = ["-crf", "24", "-preset", "medium", "-movflags", "+faststart", "-threads", "1"]
+    style = {"codec": "libx264", "quality": None, "macro_block_size": 2, "output_params": output}
+    writer = ffmpeg.write_frames(str(path), (first.shape[1], first.shape[0]), fps=fps, **style)
     writer.send(None)
     try:
-        writer.send(np.ascontiguousarray(first))
-        for image in images:
+        for image in itertools.chain([first], images):
             writer.send(np.ascontiguousarray(image))
     finally:
         writer.close()

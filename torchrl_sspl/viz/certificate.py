@@ -17,15 +17,7 @@ _SUCCESS = {"deterministic": "proved", "statistical": "yes", "paper": "yes, all 
 
 
 def certificate_section(certificate: Certificate) -> str:
-    """The certificate as HTML.
-
-    Args:
-        certificate: the certificate.
-
-    Returns:
-        A ``<section>``; no scripts, no outside resources.
-
-    Source: none.
+    """The certificate as an HTML ``<section>`` without scripts and outside resources. Source: none.
 
     Example:
         >>> from torchrl_sspl.certification import Layer
@@ -35,8 +27,9 @@ def certificate_section(certificate: Certificate) -> str:
     """
     parts = [
         "<section><h2>Certificate</h2>",
-        f"<p>About the set {{B &le; {certificate.level:g}}} of the agent <b>{escape(certificate.agent)}</b> with weights "
-        f"<code>{escape(certificate.weights[:16])}&hellip;</code>. <code>sspl verify</code> computes it again.</p>",
+        f"<p>About the set {{B &le; {certificate.level:g}}} of the agent <b>{escape(certificate.agent)}</b> with "
+        f"weights <code>{escape(certificate.weights[:16])}&hellip;</code>. "
+        "<code>sspl verify</code> computes it again.</p>",
     ]
     for name in _TITLES:
         if name not in certificate.layers:
@@ -48,15 +41,7 @@ def certificate_section(certificate: Certificate) -> str:
 
 
 def proved_lines(certificate: Certificate) -> list[str]:
-    """The proved statements as sentences, for the head of the report.
-
-    Args:
-        certificate: the certificate.
-
-    Returns:
-        One line for each statement that is proved.
-
-    Source: none.
+    """The proved statements as sentences, for the head of the report. Source: none.
 
     Example:
         >>> from torchrl_sspl.certification import Layer

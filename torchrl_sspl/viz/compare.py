@@ -16,10 +16,9 @@ from torchrl_sspl.configs.reader import EnvFactory
 from torchrl_sspl.envs.system import Requirement
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.viz.curves import read_log
-from torchrl_sspl.viz.report import badge, format_value, table
-from torchrl_sspl.viz.report_style import CSS
+from torchrl_sspl.viz.report import badge, file_uri, format_value, table, verdict_in, write_page
 
-COLOURS = ("#2166ac", "#b2182b", "#1b7837", "#b35806", "#762a83", "#01665e", "#c51b7d", "#4d4d4d")
+_COLOURS = ("#2166ac", "#b2182b", "#1b7837", "#b35806", "#762a83", "#01665e", "#c51b7d", "#4d4d4d")
 _OWN = ("out_dir", "seed", "trainer.progress", "logger.kind", "logger.project")  # no settings of what is compared
 _CSS = """
 .side{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(380px,100%),1fr));gap:14px}.side figure{margin:0}
@@ -31,16 +30,11 @@ main{max-width:1200px}.curve{width:100%;height:auto}.curve text{font-size:11px;f
 
 @dataclass(frozen=True)
 class Run:
-    """A run on disk.
+    """A run on disk."""
 
-    Attributes:
-        name: what tells it from the others.
-        directory: where it lies.
-        metrics: what its ``metrics.json`` says; of a run that has not come to an end, its configuration alone.
-    """
-
-    name: str
+    name: str  # what tells it from the others
     directory: Path
+    #: What its ``metrics.json`` says; of a run that has not come to an end, its configuration alone.
     metrics: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -52,52 +46,31 @@ class Run:
     def settings(self) -> dict[str, Any]:
         """Values by key."""
         config = self.metrics.get("config", {})
-        inner = {f"{s}.{k}": v for s, section in config.items() if isinstance(section, Mapping) for k, v in section.items()}
-        return {k: v for k, v in config.items() if not isinstance(v, Mapping)} | inner
+        sections = {name: section for name, section in config.items() if isinstance(section, Mapping)}
+        inner = {f"{name}.{k}": v for name, section in sections.items() for k, v in section.items()}
+        return {k: v for k, v in config.items() if k not in sections} | inner
 
 
 @dataclass(frozen=True)
 class Row:
-    """One measurement over the runs of one setting, which differ in their seeds.
+    """One measurement over the runs of one setting, which differ in their seeds."""
 
-    Attributes:
-        setting: what tells the setting from others, such as "synthesis.margin=0.05".
-        evaluation: where it was measured.
-        name: of the measurement.
-        label: what it is, for people.
-        unit: of the values.
-        must: limit of the requirement such as "<= 0.01", or "".
-        mean: over the runs that measured it.
-        worst: of these, by the sense of the requirement; None without one.
-        values: by run; None where it was not measured.
-        verdict: of the worst run, "not measured" if a run is missing, or "" without a requirement.
-    """
-
-    setting: str
-    evaluation: str
+    setting: str  # what tells it from others, such as "synthesis.margin=0.05"
+    evaluation: str  # where it was measured
     name: str
-    label: str
+    label: str  # what it is, for people
     unit: str
-    must: str
-    mean: float | None
-    worst: float | None
-    values: dict[str, float | None]
-    verdict: str
+    must: str  # limit of the requirement such as "<= 0.01", or ""
+    mean: float | None  # over the runs that measured it
+    worst: float | None  # of these, by the sense of the requirement; None without one
+    values: dict[str, float | None]  # by run
+    verdict: str  # of the worst run, "not measured" if a run is missing, or "" without a requirement
 
 
 def read_runs(directories: Sequence[str | Path]) -> list[Run]:
-    """Runs of these directories, named by what their paths do not share.
+    """Runs of these directories, named by what their paths do not share; without ``metrics.json`` one is not finished.
 
-    Args:
-        directories: of runs; those without ``metrics.json`` count as not finished.
-
-    Returns:
-        The runs.
-
-    Raises:
-        CheckpointError: if there is no such directory, or its ``metrics.json`` cannot be read.
-
-    Source: none.
+    Raises CheckpointError for no such directory, or a ``metrics.json`` that cannot be read. Source: none.
     """
     paths = [Path(d) for d in directories]
     shared = os.path.commonpath([p.resolve().parent for p in paths]) if paths else ""
@@ -105,7 +78,7 @@ def read_runs(directories: Sequence[str | Path]) -> list[Run]:
 
 
 def read_metrics(directory: Path) -> dict[str, Any]:
-    """What a run's directory says about it; arguments and errors as for :func:`read_runs`."""
+    """What a run's directory says about it; errors as for :func:`read_runs`."""
     if not directory.is_dir():
         raise CheckpointError(f"expected the directory of a run, received '{directory}'; train one with `sspl train`")
     for name, key in (("metrics.json", None), ("config.json", "config")):
@@ -113,38 +86,21 @@ def read_metrics(directory: Path) -> dict[str, Any]:
             try:
                 body = dict(json.loads(file.read_text()))
             except (ValueError, TypeError) as error:
-                raise CheckpointError(f"expected readable numbers in '{file}', received {error}; run it again") from error
+                message = f"expected readable numbers in '{file}', received {error}; run it again"
+                raise CheckpointError(message) from error
             return {key: body} if key else body
     return {}
 
 
 def differing(runs: Sequence[Run]) -> list[str]:
-    """Keys in which the settings of runs differ, apart from seed and directory.
-
-    Args:
-        runs: the runs.
-
-    Returns:
-        The keys.
-
-    Source: none.
-    """
+    """Keys in which the settings of runs differ, apart from seed and directory."""
     settings = [run.settings for run in runs if run.metrics]
     keys = dict.fromkeys(k for s in settings for k in s)
     return [k for k in keys if k not in _OWN and any(s.get(k) != settings[0].get(k) for s in settings)]
 
 
 def rows_of(runs: Sequence[Run]) -> list[Row]:
-    """The table over runs: what is required first, then whatever else was measured.
-
-    Args:
-        runs: the runs.
-
-    Returns:
-        A row for every setting, evaluation and measurement.
-
-    Source: none.
-    """
+    """The table over runs, a row for every setting, evaluation and measurement: what is required comes first."""
     keys = differing(runs)
     groups: dict[str, list[Run]] = {}
     for run in runs:
@@ -163,21 +119,22 @@ def rows_of(runs: Sequence[Run]) -> list[Row]:
     return rows
 
 
-def _row(setting: str, evaluation: str, name: str, shown: str, runs: Sequence[Run], required: Requirement | None) -> Row:
+def _row(
+    setting: str, evaluation: str, name: str, shown: str, runs: Sequence[Run], required: Requirement | None
+) -> Row:
     found = [_measured(run).get(evaluation, {}).get(name, {}) for run in runs]
     values = {run.name: _number(m.get("value")) for run, m in zip(runs, found, strict=True)}
     known = [v for v in values.values() if v is not None]
     mean = sum(known) / len(known) if known else None
-    unit = next((m["unit"] for m in found if m.get("unit")), "share" if required and max(required.must, required.aim) <= 1 else "")
+    default = "share" if required and max(required.must, required.aim) <= 1 else ""
+    unit = next((m["unit"] for m in found if m.get("unit")), default)
     if required is None:
         return Row(setting, evaluation, name, name + shown, unit, "", mean, None, values, "")
     worst = (max if required.sense == "<=" else min)(known, default=None)
     asked = worst if len(known) == len(values) else None
     verdict = required.verdict(SimpleNamespace(measurements={name: SimpleNamespace(value=asked)}))
-    if unit == "share" and verdict.startswith("missed by "):
-        verdict = f"missed by {format_value(float(verdict.removeprefix('missed by ')), unit)}"
-    must = f"{required.sense} {format_value(required.must, unit)}"
-    return Row(setting, evaluation, name, required.label + shown, unit, must, mean, worst, values, verdict)
+    must, label = f"{required.sense} {format_value(required.must, unit)}", required.label + shown
+    return Row(setting, evaluation, name, label, unit, must, mean, worst, values, verdict_in(unit, verdict))
 
 
 def _number(value: Any) -> float | None:
@@ -206,27 +163,26 @@ def _show(value: Any) -> str:
 
 
 def text_table(rows: Sequence[Row]) -> str:
-    """Rows with a requirement as text, a block for every setting.
-
-    Args:
-        rows: see :func:`rows_of`; without any requirement all of them are shown.
-
-    Returns:
-        The text.
-
-    Source: none.
-    """
+    """Rows with a requirement (all rows if none has one) as text, a block for every setting."""
     rows = [r for r in rows if r.must] or list(rows)
     lines: list[str] = []
+    for setting, block, names in _blocks(rows):
+        text = [["", "must", "mean", "worst", "verdict", *names]]
+        for r in block:
+            values = [r.values.get(n) for n in names]
+            text.append([*_cells(r), *("-" if v is None else format_value(v, r.unit) for v in values)])
+        widths = [max(map(len, column)) for column in zip(*text, strict=True)]
+        lines += [setting] if setting else []
+        lines += ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in text]
+        lines.append("")
+    return "\n".join(lines).rstrip()
+
+
+def _blocks(rows: Sequence[Row]) -> Iterator[tuple[str, list[Row], list[str]]]:
+    """Settings with their rows and the names of their runs."""
     for setting in dict.fromkeys(r.setting for r in rows):
         block = [r for r in rows if r.setting == setting]
-        names = list(dict.fromkeys(n for r in block for n in r.values))
-        head = ["", "must", "mean", "worst", "verdict", *names]
-        body = [[*(_cells(r)), *(format_value(r.values.get(n), r.unit) if r.values.get(n) is not None else "-" for n in names)] for r in block]
-        widths = [max(len(line[i]) for line in [head, *body]) for i in range(len(head))]
-        lines += [setting] if setting else []
-        lines += ["  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)).rstrip() for line in [head, *body]] + [""]
-    return "\n".join(lines).rstrip()
+        yield setting, block, list(dict.fromkeys(n for r in block for n in r.values))
 
 
 def _cells(row: Row) -> list[str]:
@@ -235,47 +191,29 @@ def _cells(row: Row) -> list[str]:
 
 
 def compare(runs: Sequence[str | Path] | Sequence[Run], path: str | Path, *, title: str = "") -> Path:
-    """Write a page that shows runs beside each other; self-contained, without scripts.
+    """Write a page that shows runs (directories, or runs that were read) beside each other; self-contained, no scripts.
 
-    Args:
-        runs: directories of runs, or runs that were read.
-        path: file to write; its folder is created.
-        title: of the page.
-
-    Returns:
-        The file.
-
-    Raises:
-        CheckpointError: if there is no run, or one of them cannot be read.
-
+    Returns the file; its folder is created. Raises CheckpointError if no run is finished, or one cannot be read.
     Source: none.
     """
     found = [r for r in runs if isinstance(r, Run)] or read_runs([r for r in runs if not isinstance(r, Run)])
     if not any(run.finished for run in found):
         raise CheckpointError(f"expected at least one run with metrics.json, received {len(found)} directories without")
-    rows, title = rows_of(found), title or f"{len(found)} runs"
+    rows, keys = rows_of(found), differing(found)
     required = [r for r in rows if r.must]
+    settings = _settings(found, list(dict.fromkeys(k for run in found for k in run.settings)))
     parts = [
         ("Runs", _overview(found)),
-        ("Settings that differ", _settings(found, differing(found))),
+        ("Settings that differ", _settings(found, keys)),
         ("Requirements", _side(required) + _table(required)),
         ("Figures", _figures(found)),
         ("Curves", _curves(found)),
         ("", f"<details><summary>All measurements</summary>{_table(rows)}</details>"),
-        ("", f"<details><summary>All settings</summary>{_settings(found, list(dict.fromkeys(k for run in found for k in run.settings)))}</details>"),
+        ("", f"<details><summary>All settings</summary>{settings}</details>"),
     ]
     body = "".join(f"<section>{f'<h2>{name}</h2>' if name else ''}{text}</section>" for name, text in parts if text)
-    page = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{CSS}{_CSS}</style></head><body><main><header><h1>{escape(title)}</h1>"
-        f"<p class='facts'>{len(differing(found))} settings differ, apart from the seed</p></header>{body}</main></body></html>\n"
-    )
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
-    part.write_text(page, encoding="utf-8")
-    return part.replace(path)
+    facts = f"{len(keys)} settings differ, apart from the seed"
+    return write_page(path, title or f"{len(found)} runs", facts, body, _CSS)
 
 
 def _overview(runs: Sequence[Run]) -> str:
@@ -295,9 +233,7 @@ def _overview(runs: Sequence[Run]) -> str:
 
 def _table(rows: Sequence[Row]) -> str:
     out = []
-    for setting in dict.fromkeys(r.setting for r in rows):
-        block = [r for r in rows if r.setting == setting]
-        names = list(dict.fromkeys(n for r in block for n in r.values))
+    for setting, block, names in _blocks(rows):
         cells = []
         for r in block:
             label, must, mean, worst, verdict = (escape(c) for c in _cells(r))
@@ -318,7 +254,10 @@ def _side(rows: Sequence[Row]) -> str:
         places.setdefault(r.label, {})[r.setting] = r
     cells = []
     for label, found in places.items():
-        text = {s: f"<b>{escape(_cells(r)[3])}</b> {badge(r.verdict)}<br>mean {escape(_cells(r)[2])}" for s, r in found.items()}
+        text = {}
+        for setting, r in found.items():
+            _, _, mean, worst, verdict = _cells(r)
+            text[setting] = f"<b>{escape(worst)}</b> {badge(verdict)}<br>mean {escape(mean)}"
         must = next((r.must for r in found.values() if r.mean is not None), next(iter(found.values())).must)
         cells.append([escape(label), escape(must), *(text.get(s, "") for s in settings)])
     return table(["Worst, verdict and mean", "Must", *settings], cells, kind="plain")
@@ -330,13 +269,11 @@ def _settings(runs: Sequence[Run], keys: Sequence[str]) -> str:
 
 
 def _figures(runs: Sequence[Run]) -> str:
-    from torchrl_sspl.viz.report import _file_uri
-
     files = {run.name: {p.name: p for p in sorted((run.directory / "figures").glob("*.png"))} for run in runs}
     out = []
     for name in dict.fromkeys(n for found in files.values() for n in found):
         shown = [
-            f'<figure><img alt="{escape(name)}" src="{_file_uri(files[run.name][name])[0]}">'
+            f'<figure><img alt="{escape(name)}" src="{file_uri(files[run.name][name])}">'
             f"<figcaption>{escape(run.name)}</figcaption></figure>"
             for run in runs
             if name in files[run.name]
@@ -353,7 +290,7 @@ def _curves(runs: Sequence[Run]) -> str:
             panels.setdefault(title, {}).setdefault(run.name, []).append(point)
     if not panels:
         return ""
-    colour = {run.name: COLOURS[i % len(COLOURS)] for i, run in enumerate(runs)}
+    colour = {run.name: _COLOURS[i % len(_COLOURS)] for i, run in enumerate(runs)}
     key = "".join(f'<i style="background:{c}"></i>{escape(n)}' for n, c in colour.items())
     drawn = "".join(_panel(title, lines, colour) for title, lines in panels.items())
     return f"<p class='key'>{key}</p><div class='side small'>{drawn}</div>"
@@ -385,16 +322,15 @@ def _panel(title: str, lines: Mapping[str, list[tuple[float, float]]], colour: M
     low, high = height(min(y for _, y in points)), height(max(y for _, y in points))
 
     def place(x: float, y: float) -> str:
-        return f"{40 + 250 * (x - left) / ((right - left) or 1):.1f},{130 - 110 * (height(y) - low) / ((high - low) or 1):.1f}"
+        across = 40 + 250 * (x - left) / ((right - left) or 1)
+        return f"{across:.1f},{130 - 110 * (height(y) - low) / ((high - low) or 1):.1f}"
 
-    drawn = "".join(
-        f'<polyline fill="none" stroke-width="1.5" stroke="{colour[name]}" points="{" ".join(place(*p) for p in line[:: len(line) // 400 + 1])}"/>'
-        for name, line in lines.items()
-    )
-    ends = [10**v if log else v for v in (low, high)]
-    text = f'<text x="0" y="134">{ends[0]:.2g}</text><text x="0" y="24">{ends[1]:.2g}</text><text x="265" y="148">{right:g}</text>'
+    drawn = ""
+    for name, line in lines.items():
+        path = " ".join(place(*p) for p in line[:: len(line) // 400 + 1])
+        drawn += f'<polyline fill="none" stroke-width="1.5" stroke="{colour[name]}" points="{path}"/>'
+    bottom, top = (10**v if log else v for v in (low, high))
+    texts = [(40, 12, escape(title)), (0, 134, f"{bottom:.2g}"), (0, 24, f"{top:.2g}"), (265, 148, f"{right:g}")]
+    head, *marks = (f'<text x="{x}" y="{y}">{text}</text>' for x, y, text in texts)
     axes = '<line x1="40" y1="130" x2="290" y2="130"/><line x1="40" y1="20" x2="40" y2="130"/>'
-    return f'<svg class="curve" viewBox="0 0 300 152" role="img"><text x="40" y="12">{escape(title)}</text>{axes}{text}{drawn}</svg>'
-
-
-__all__ = ["Row", "Run", "compare", "differing", "read_runs", "rows_of", "text_table"]
+    return f'<svg class="curve" viewBox="0 0 300 152" role="img">{head}{axes}{"".join(marks)}{drawn}</svg>'

@@ -18,18 +18,9 @@ if TYPE_CHECKING:
 
 
 def read_log(path: str | Path) -> list[dict[str, Any]]:
-    """Rows of a training's ``log.jsonl``; a last line cut short by an interruption is left out.
+    """Rows of a training's ``log.jsonl``, each with "phase", "round" and "step"; a last line cut short is left out.
 
-    Args:
-        path: the file.
-
-    Returns:
-        One dictionary per row, each with "phase", "round" and "step".
-
-    Raises:
-        CheckpointError: the file is missing, empty, or not a log.
-
-    Source: none.
+    Raises CheckpointError if the file is missing, empty, or not a log. Source: none.
     """
     path = Path(path)
     if not path.is_file():
@@ -54,24 +45,14 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
 def training_curves(path: str | Path) -> Figure:
     """Losses of every phase of a training over its optimiser steps, and the held-out checks of every round.
 
-    Args:
-        path: a run's ``log.jsonl``: one JSON object per line with ``phase``, ``round``, ``step`` and ``loss_*``.
-
-    Returns:
-        The figure, one panel per phase; its label is a caption.
-
-    Raises:
-        CheckpointError: the file is missing, empty, or not a log.
-        MissingDependencyError: matplotlib is not installed.
-
+    One panel per phase of a run's ``log.jsonl`` (one JSON object per line with ``phase``, ``round``, ``step``,
+    ``loss_*``); the figure's label is a caption. Raises CheckpointError if the file is missing, empty, or not a log.
     Source: paper Algorithm 1 (phases); the paper shows no curves.
 
     Example:
-        >>> import tempfile
-        >>> with tempfile.NamedTemporaryFile("w", suffix=".jsonl") as file:
-        ...     _ = file.write('{"phase": "fit", "round": 0, "step": 100, "loss_safe": 0.1}')
-        ...     file.flush()
-        ...     len(training_curves(file.name).axes)
+        >>> from pathlib import Path
+        >>> _ = Path("log.jsonl").write_text('{"phase": "fit", "round": 0, "step": 100, "loss_safe": 0.1}')
+        >>> len(training_curves("log.jsonl").axes)
         1
     """
     log = read_log(path)
@@ -83,11 +64,8 @@ def training_curves(path: str | Path) -> Figure:
         raise CheckpointError(f"expected losses or checks in '{path}', received {len(log)} rows without either.")
     columns = min(3, len(phases))
     lines = math.ceil(len(phases) / columns)
-    figure = new_figure(
-        4.0 * columns,
-        3.1 * lines,
-        "Losses of every phase (rounds follow one another, dotted lines between them).",
-    )
+    caption = "Losses of every phase (rounds follow one another, dotted lines between them)."
+    figure = new_figure(4.0 * columns, 3.1 * lines, caption)
     for k, (phase, rows) in enumerate(phases.items()):
         ax = figure.add_subplot(lines, columns, k + 1)
         ax.set_title(phase, fontsize=10)
@@ -112,51 +90,27 @@ def _draw_losses(ax: Axes, rows: list[dict[str, Any]]) -> None:
         if (value > 0).any():
             shown = np.where(value > 0, value, np.nan)
             ax.plot(at, shown, ".-", color=colour, linewidth=1.0, markersize=3, label=label)
+            ax.set_yscale("log")
         else:
             ax.plot([], [], color=colour, label=f"{label} (0)")
-    if any((float(row.get(n) or 0.0)) > 0 for row in rows for n in names):
-        ax.set_yscale("log")
     ax.set_xlabel("step", fontsize=8)
     _legend_below(ax)
 
 
 def _legend_below(ax: Axes) -> None:
-    ax.legend(
-        fontsize=7,
-        frameon=False,
-        loc="upper center",
-        bbox_to_anchor=(0.5, -0.2),
-        ncols=3,
-        labelspacing=0.25,
-        columnspacing=1.0,
-        handlelength=1.4,
-    )
+    place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2), "ncols": 3}
+    ax.legend(fontsize=7, frameon=False, labelspacing=0.25, columnspacing=1.0, handlelength=1.4, **place)
 
 
 def _draw_checks(ax: Axes, rows: list[dict[str, Any]]) -> None:
-    number = [row["round"] for row in rows]
-    for colour, name, label in (
-        (PATH_COLOURS[0], "size", "size of the set"),
-        (PATH_COLOURS[1], "returned", "returned"),
-    ):
-        ax.plot(
-            number,
-            [float(row.get(name) or 0.0) for row in rows],
-            "o-",
-            color=colour,
-            linewidth=1.1,
-            label=label,
-        )
+    def draw(name: str, shown: list[dict[str, Any]], style: str, **look: Any) -> None:
+        ax.plot([row["round"] for row in shown], [float(row.get(name) or 0.0) for row in shown], style, **look)
+
+    draw("size", rows, "o-", color=PATH_COLOURS[0], linewidth=1.1, label="size of the set")
+    draw("returned", rows, "o-", color=PATH_COLOURS[1], linewidth=1.1, label="returned")
     failed = [row for row in rows if not row.get("passed")]
-    ax.plot(
-        [r["round"] for r in failed],
-        [float(r.get("size") or 0.0) for r in failed],
-        "x",
-        color="#c8372d",
-        markersize=10,
-        label="check failed",
-    )
-    ax.set(ylim=(-0.03, 1.03), xticks=sorted(set(number)))
+    draw("size", failed, "x", color="#c8372d", markersize=10, label="check failed")
+    ax.set(ylim=(-0.03, 1.03), xticks=sorted({row["round"] for row in rows}))
     ax.set_xlabel("round", fontsize=8)
     ax.set_ylabel("share", fontsize=8)
     _legend_below(ax)

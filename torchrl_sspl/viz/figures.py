@@ -1,7 +1,8 @@
-"""Figures of the paper's case studies: latent space, state plane, trajectories, frames, losses."""
+"""Figures of the paper's case studies: latent space, state plane, trajectories, frames."""
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
@@ -11,25 +12,22 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.viz.curves import training_curves
 from torchrl_sspl.viz.plane import (
     BARRIER_COLOUR,
     KERNEL_COLOUR,
-    OUTSIDE_FILL,
     PATH_COLOURS,
     POINTS,
     Plane,
     array,
+    line_handle,
     new_figure,
     require,
     zero_level,
-)
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-__all__ = ["frames", "latent_space", "state_plane", "training_curves", "trajectories"]
 
 _POINT_SIZE = {0: 5, 1: 9, 2: 9}
 
@@ -54,16 +52,8 @@ def _scatter(ax: Any, points: np.ndarray, codes: np.ndarray, **style: Any) -> No
     for code, (colour, marker, label) in POINTS.items():
         p = points[codes == code]
         if len(p):
-            ax.scatter(
-                *p.T,
-                s=_POINT_SIZE[code],
-                c=colour,
-                marker=marker,
-                linewidths=0,
-                alpha=0.75,
-                label=label,
-                **style,
-            )
+            look = {"s": _POINT_SIZE[code], "c": colour, "marker": marker, "linewidths": 0, "alpha": 0.75, **style}
+            ax.scatter(*p.T, label=label, **look)
 
 
 def latent_space(
@@ -86,13 +76,7 @@ def latent_space(
         max_points: points drawn of each region at most.
         near: barrier value up to which a point counts as on the border.
 
-    Returns:
-        The figure; its label is a caption.
-
-    Raises:
-        ShapeError, ConfigError, NonFiniteError: the latents or codes are not what was expected.
-        MissingDependencyError: matplotlib is not installed.
-
+    The figure's label is a caption. Raises ShapeError, ConfigError or NonFiniteError for other latents or codes.
     Source: paper Section V, figure "plot_latent_pend"; deviation: none.
 
     Example:
@@ -123,11 +107,10 @@ def latent_space(
     else:
         figure = new_figure(6, 5, f"{caption} in the first two principal components; black: near the barrier's zero.")
         _latent_components(figure, z, codes, rows, border, style)
-    handles, labels = figure.axes[0].get_legend_handles_labels()
+    handles = figure.axes[0].get_legend_handles_labels()[0]
     if p == 2 and barrier is not None:
-        handles.append(_line(BARRIER_COLOUR, "B = 0"))
-        labels.append("B = 0")
-    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False, markerscale=1.8)
+        handles.append(line_handle(BARRIER_COLOUR, "B = 0"))
+    figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, markerscale=1.8)
     return figure
 
 
@@ -190,10 +173,6 @@ def _evaluate(barrier: Callable[[Tensor], Tensor], latent: np.ndarray) -> np.nda
     return value[:, 0].double().numpy()
 
 
-def _line(colour: str, label: str, style: str = "-") -> Any:
-    return require("matplotlib.lines").Line2D([], [], color=colour, linestyle=style, linewidth=1.8, label=label)
-
-
 def state_plane(
     plane: Plane,
     states: Any,
@@ -218,20 +197,12 @@ def state_plane(
         max_points: points drawn of each region at most.
         reduce: over coordinates not shown, see ``Plane.grid``.
 
-    Returns:
-        The figure; its label is a caption.
-
-    Raises:
-        ShapeError, NonFiniteError, ConfigError: an argument is not what was expected.
-        MissingDependencyError: matplotlib is not installed.
-
+    The figure's label is a caption. Raises ShapeError, NonFiniteError or ConfigError for arguments that do not fit.
     Source: paper Section V, figures "sys_pend" and "plot_real_pend"; deviation: the true kernel is added.
 
     Example:
-        >>> from torchrl_sspl.sets import Box
-        >>> space = Box([-1.0, -1.0], [1.0, 1.0])
-        >>> states = space.grid(21)
-        >>> plane = Plane(("x", "y"), [-1, -1], [1, 1], safe_set=Box([-0.1, -0.1], [0.1, 0.1]))
+        >>> states = torch.cartesian_prod(torch.linspace(-1, 1, 21), torch.linspace(-1, 1, 21))
+        >>> plane = Plane(("x", "y"), [-1, -1], [1, 1])
         >>> state_plane(plane, states, states.norm(dim=-1) - 0.5).axes[0].get_xlabel()
         'x'
     """
@@ -240,24 +211,22 @@ def state_plane(
         v = torch.as_tensor(viable)
         values["viable"] = v if v.dtype == torch.bool else -v  # negative inside, like a barrier
     x, y, table = plane.grid(states, values, reduce)
-    figure = new_figure(
-        6.6,
-        5.2,
-        "Learned safe set {B \u2264 0} (inside the black line) in the state plane, with the labelled sets S (green) and "
-        "U (red)" + (", and the border of the true viability kernel (blue)." if viable is not None else "."),
+    caption = (
+        "Learned safe set {B \u2264 0} (inside the black line) in the state plane, with the labelled sets S (green) "
+        "and U (red)" + (", and the border of the true viability kernel (blue)." if viable is not None else ".")
     )
+    figure = new_figure(6.6, 5.2, caption)
     ax = figure.add_subplot()
     plane.draw(ax)
     handles = plane.set_handles()
     inside = table["barrier"] <= 0
     if inside.any():
         ax.contourf(x, y, table["barrier"], levels=[-np.inf, 0], colors=["#22304a"], alpha=0.13, zorder=1)
-    if "viable" in table and zero_level(
-        ax, x, y, table["viable"], colors=KERNEL_COLOUR, linewidths=1.6, linestyles="--", zorder=3
-    ):
-        handles.append(_line(KERNEL_COLOUR, "true viability kernel", "--"))
+    dashed = {"colors": KERNEL_COLOUR, "linewidths": 1.6, "linestyles": "--", "zorder": 3}
+    if "viable" in table and zero_level(ax, x, y, table["viable"], **dashed):
+        handles.append(line_handle(KERNEL_COLOUR, "true viability kernel", "--"))
     if zero_level(ax, x, y, table["barrier"], colors=BARRIER_COLOUR, linewidths=2.0, zorder=4):
-        handles.append(_line(BARRIER_COLOUR, "B = 0"))
+        handles.append(line_handle(BARRIER_COLOUR, "B = 0"))
     else:
         ax.set_title("B \u2264 0 nowhere" if not inside.any() else "B \u2264 0 everywhere", fontsize=10)
     if points is not None:
@@ -304,14 +273,8 @@ def trajectories(
         lengths: ``(n,)`` steps after which each episode was over; None: all steps are drawn.
         caption: what the figure shows.
 
-    Returns:
-        The figure; its label is a caption.
-
-    Raises:
-        ShapeError, NonFiniteError: an argument is not what was expected.
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Section V, figures "sspl_pend" and "traj_sspl_gr"; deviation: time series are added.
+    The figure's label is a caption. Raises ShapeError or NonFiniteError for arguments that do not fit. Source: paper
+    Section V, figures "sspl_pend" and "traj_sspl_gr"; deviation: time series are added.
 
     Example:
         >>> plane = Plane(("x", "y"), [-1, -1], [1, 1])
@@ -329,10 +292,8 @@ def trajectories(
     extent = np.array([plane.high[k] - plane.low[k] for k in plane.coords])
     chosen = _spread(x[0][:, list(plane.coords)] / extent, min(episodes, n))
     largest = action_scale or max(float(np.abs(u).max()), 1e-12)
-    size = f"; the longest arrow is {largest:.3g} ({action_name})"
-    figure = new_figure(
-        10.5, 5.0, (caption or f"{len(chosen)} trajectories of the learned policy").rstrip(".") + size + "."
-    )
+    caption = (caption or f"{len(chosen)} trajectories of the learned policy").rstrip(".")
+    figure = new_figure(10.5, 5.0, f"{caption}; the longest arrow is {largest:.3g} ({action_name}).")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
     ax = figure.add_subplot(grid[:, 0])
     handles = _draw_sets(ax, plane, x[:, chosen][..., list(plane.coords)].reshape(-1, 2), background)
@@ -340,12 +301,10 @@ def trajectories(
     for colour, k in colours:
         path = x[: last[k] + 1, k][:, list(plane.coords)]
         _draw_path(ax, plane, path, u[: last[k], k] / largest, extent, colour, action_direction, arrows)
-    marker = require("matplotlib.lines").Line2D
-    handles.append(marker([], [], marker="o", color="#555555", linewidth=1.2, label="start and path"))
+    marker = functools.partial(require("matplotlib.lines").Line2D, [], [], color="#555555")
+    handles.append(marker(marker="o", linewidth=1.2, label="start and path"))
     arrow = "$\\uparrow$" if action_direction is not None else "$\\rightarrow$"
-    handles.append(
-        marker([], [], marker=arrow, color="#555555", linestyle="", markersize=9, label=f"{action_name}, size")
-    )
+    handles.append(marker(marker=arrow, linestyle="", markersize=9, label=f"{action_name}, size"))
     figure.legend(handles=handles, loc="outside lower center", ncols=6, frameon=False)
     _draw_over_time(figure, grid, values, u, last, colours, dt, action_name)
     return figure
@@ -354,15 +313,13 @@ def trajectories(
 def _draw_sets(ax: Axes, plane: Plane, cover: np.ndarray, background: tuple[Any, Any] | None) -> list[Any]:
     """The plane with its sets, what lies beyond it and the line B = 0, as far as points reach; legend entries."""
     plane.draw(ax, cover=cover)
-    handles = plane.set_handles()
     limits = [(plane.low[k] - 1e-4, plane.high[k] + 1e-4) for k in plane.coords]
-    if any(cover[:, k].min() < low or cover[:, k].max() > high for k, (low, high) in enumerate(limits)):
-        patch = require("matplotlib.patches").Patch
-        handles.append(patch(facecolor=OUTSIDE_FILL, edgecolor="#9a9a9a", linewidth=0.5, label="beyond the space"))
+    beyond = any(cover[:, k].min() < low or cover[:, k].max() > high for k, (low, high) in enumerate(limits))
+    handles = plane.set_handles(beyond=beyond)
     if background is not None:
         gx, gy, table = plane.grid(background[0], {"barrier": background[1]})
         if zero_level(ax, gx, gy, table["barrier"], colors=BARRIER_COLOUR, linewidths=1.8, zorder=2):
-            handles.append(_line(BARRIER_COLOUR, "B = 0"))
+            handles.append(line_handle(BARRIER_COLOUR, "B = 0"))
     return handles
 
 
@@ -383,8 +340,8 @@ def _draw_path(
 
 
 def _draw_over_time(
-    figure: Figure, grid: Any, values: np.ndarray | None, u: np.ndarray, last: np.ndarray, colours: list[tuple[str, int]],
-    dt: float | None, action_name: str,
+    figure: Figure, grid: Any, values: np.ndarray | None, u: np.ndarray, last: np.ndarray,
+    colours: list[tuple[str, int]], dt: float | None, action_name: str,
 ) -> None:  # fmt: skip
     """Barrier value, if there is one, and action of the chosen episodes over time."""
     time = np.arange(len(u) + 1) * (dt or 1.0)
@@ -440,14 +397,8 @@ def frames(env: Any, states: Any, *, captions: Sequence[str] | None = None, both
         captions: one per state; default: its coordinates.
         both: show the frame of the step before as well, in a row of its own.
 
-    Returns:
-        The figure; its label is a caption.
-
-    Raises:
-        ShapeError: there is no state, too many, or another number of captions.
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Section V, figures "sys_pend" and "sspl_gr"; deviation: none.
+    The figure's label is a caption. Raises ShapeError for no state, too many, or another number of captions. Source:
+    paper Section V, figures "sys_pend" and "sspl_gr"; deviation: none.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
@@ -465,13 +416,12 @@ def frames(env: Any, states: Any, *, captions: Sequence[str] | None = None, both
     rows = 2 if both else 1
     figure = new_figure(1.25 * n + 0.4, 1.25 * rows + 0.35, "Observations: what the agent sees, and nothing else.")
     axes = figure.subplots(rows, n, squeeze=False)
-    for k in range(n):
-        for row in range(rows):
-            ax = axes[row, k]
-            channels = slice(0, 3) if both and row == 0 else slice(3, 6)
-            ax.imshow(pixels[k, channels].permute(1, 2, 0).numpy(), interpolation="nearest")
+    shown = [("t \u2212 1", slice(0, 3)), ("t", slice(3, 6))][-rows:]
+    for row, (time, channels) in zip(axes, shown, strict=True):
+        for ax, picture in zip(row, pixels, strict=True):
+            ax.imshow(picture[channels].permute(1, 2, 0).numpy(), interpolation="nearest")
             ax.set(xticks=[], yticks=[])
-        axes[0, k].set_title(names[k], fontsize=8)
-    for row in range(rows):
-        axes[row, 0].set_ylabel("t \u2212 1" if both and row == 0 else "t", fontsize=9)
+        row[0].set_ylabel(time, fontsize=9)
+    for ax, name in zip(axes[0], names, strict=True):
+        ax.set_title(name, fontsize=8)
     return figure

@@ -25,52 +25,22 @@ POINTS: dict[int, tuple[str, str, str]] = {
     2: ("#c8372d", "^", "unsafe (U)"),
     1: ("#15803d", "o", "safe (S)"),
 }
-BARRIER_COLOUR, KERNEL_COLOUR, PATH_COLOURS = (
-    "#111111",
-    "#1d4ed8",
-    ("#0072b2", "#d55e00", "#6b4c9a", "#00806b", "#b8860b", "#c2185b", "#4d6a00", "#5c5c5c"),
-)
+BARRIER_COLOUR, KERNEL_COLOUR = "#111111", "#1d4ed8"
+PATH_COLOURS = ("#0072b2", "#d55e00", "#6b4c9a", "#00806b", "#b8860b", "#c2185b", "#4d6a00", "#5c5c5c")
 
 
-def require(module: str, extra: str = "viz") -> Any:
-    """Import an optional module, or say how to install it.
-
-    Args:
-        module: name of the module.
-        extra: extra of this package that installs it.
-
-    Returns:
-        The module.
-
-    Raises:
-        MissingDependencyError: it is not installed.
-
-    Source: none.
-
-    Example:
-        >>> require("math").pi > 3
-        True
-    """
+def require(module: str) -> Any:
+    """Import an optional module; MissingDependencyError says how to install it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
         raise MissingDependencyError(
-            f"expected the module '{module}', which is not installed; pip install 'torchrl-sspl[{extra}]'."
+            f"expected the module '{module}', which is not installed; pip install 'torchrl-sspl[viz]'."
         ) from error
 
 
 def new_figure(width: float, height: float, caption: str = "") -> Figure:
-    """Empty figure of its own, outside pyplot's global state; its label is the caption that a report prints.
-
-    Args:
-        width, height: size in inches.
-        caption: what the figure shows, in a sentence.
-
-    Returns:
-        The figure, drawn by the Agg backend.
-
-    Raises:
-        MissingDependencyError: matplotlib is not installed.
+    """Empty figure of a size in inches, outside pyplot's global state; its label is the caption that a report prints.
 
     Source: none.
 
@@ -86,21 +56,9 @@ def new_figure(width: float, height: float, caption: str = "") -> Figure:
 
 
 def array(name: str, value: Any, shape: tuple[int | None, ...], *, finite: bool = True) -> np.ndarray:
-    """Values as a NumPy array of a given shape (None: any size).
+    """Values (tensor, array or nested list) as a float64 or bool array of a given shape (None: any size).
 
-    Args:
-        name: name of the argument, for messages.
-        value: tensor, array or nested list.
-        shape: expected shape.
-        finite: refuse NaN and infinity.
-
-    Returns:
-        float64 array, or bool where the values are bool.
-
-    Raises:
-        ShapeError, DTypeError, NonFiniteError: the values are not what was expected.
-
-    Source: none.
+    ShapeError, DTypeError and NonFiniteError call them ``name``; ``finite``: refuse NaN and infinity. Source: none.
 
     Example:
         >>> array("x", [[1, 2]], (None, 2)).shape
@@ -132,10 +90,8 @@ class Plane:
         coords: which two coordinates of the state are shown.
         fixed: values of the other coordinates at which S and U are drawn; default: the middle of their range.
 
-    Raises:
-        ConfigError: the coordinates or the range are not valid.
-
-    Source: paper Section V, figure "plot_real_pend".
+    Raises ConfigError for other coordinates or ranges. Source: paper Section V, figure "plot_real_pend"; deviation:
+    none.
 
     Example:
         >>> Plane(("x [m]", "y [m]"), [-2.0, -2.0, -3.14], [2.0, 2.0, 3.14]).dim
@@ -167,47 +123,23 @@ class Plane:
 
     @classmethod
     def of(
-        cls,
-        env: Any,
-        names: tuple[str, str] = ("x0", "x1"),
-        *,
-        coords: tuple[int, int] = (0, 1),
+        cls, env: Any, names: tuple[str, str] = ("x0", "x1"), *, coords: tuple[int, int] = (0, 1),
         fixed: dict[int, float] | None = None,
-    ) -> Plane:
-        """Plane of an environment's state space with its safe and unsafe sets.
+    ) -> Plane:  # fmt: skip
+        """Plane of an environment's ``state_space`` (a box, or a box with holes), ``safe_set`` and ``unsafe_set``.
 
-        Args:
-            env: has ``state_space`` (a box, or a box with holes), ``safe_set`` and ``unsafe_set``.
-            names: names and units of the two coordinates.
-            coords: which two coordinates of the state are shown.
-            fixed: values of the other coordinates at which S and U are drawn.
-
-        Returns:
-            The plane.
-
-        Raises:
-            ConfigError: the state space is not a box.
-
-        Source: none.
+        The other arguments are those of the class. Raises ConfigError if the state space is no box. Source: none.
         """
         space = env.state_space
         while isinstance(space, Difference):
             space = space.a
         if not isinstance(space, Box):
             raise ConfigError(
-                f"plane: expected an environment whose state_space is a Box, received {type(space).__name__}; build the "
-                "Plane from low and high."
+                f"plane: expected an environment whose state_space is a Box, received {type(space).__name__}; "
+                "build the Plane from low and high."
             )
-        return cls(
-            names,
-            space.low.tolist(),
-            space.high.tolist(),
-            space.period.tolist(),
-            env.safe_set,
-            env.unsafe_set,
-            coords,
-            dict(fixed or {}),
-        )
+        corners = space.low.tolist(), space.high.tolist(), space.period.tolist()
+        return cls(names, *corners, env.safe_set, env.unsafe_set, coords, dict(fixed or {}))
 
     @property
     def dim(self) -> int:
@@ -217,26 +149,22 @@ class Plane:
     def draw(self, ax: Axes, *, cover: np.ndarray | None = None, resolution: int = 480) -> None:
         """Axes with names and limits, and the sets S and U as areas; what lies outside the state space is grey.
 
-        Args:
-            ax: matplotlib axes to draw on.
-            cover: ``(k, 2)`` points in the plane that must be seen, even outside the state space.
-            resolution: pixels per coordinate of the areas.
+        Points ``cover`` ``(k, 2)`` are seen even outside the state space; areas have ``resolution`` pixels per
+        coordinate.
         """
         i, j = self.coords
         corners = np.array([[self.low[i], self.low[j]], [self.high[i], self.high[j]]])
-        lower, upper = (
-            corners if cover is None else (np.minimum(corners[0], cover.min(0)), np.maximum(corners[1], cover.max(0)))
-        )
+        lower, upper = corners
+        if cover is not None:
+            lower, upper = np.minimum(lower, cover.min(0)), np.maximum(upper, cover.max(0))
         # A little room beyond a point, none where the state space itself is the limit.
         lower, upper = (
             b + 0.03 * (b - c) / np.maximum(np.abs(b - c), 1e-9) * (upper - lower) * (np.abs(b - c) > 1e-5)
             for b, c in zip((lower, upper), corners, strict=True)
         )
         extent = (float(lower[0]), float(upper[0]), float(lower[1]), float(upper[1]))
-        state = torch.tensor(
-            [self.fixed.get(k, (a + b) / 2) for k, (a, b) in enumerate(zip(self.low, self.high, strict=True))]
-        )
-        state = state.repeat(resolution * resolution, 1)
+        middles = [self.fixed.get(k, (self.low[k] + self.high[k]) / 2) for k in range(self.dim)]
+        state = torch.tensor(middles).repeat(resolution * resolution, 1)
         # Centres of the pixels, so that an area ends where its set ends.
         middle = (torch.arange(resolution) + 0.5) / resolution
         y, x = torch.meshgrid(middle, middle, indexing="ij")
@@ -250,30 +178,24 @@ class Plane:
         shown = state[:, [i, j]].numpy()
         image[((shown < corners[0]) | (shown > corners[1])).any(1)] = to_rgb(OUTSIDE_FILL)
         units = [name.partition("[")[2] for name in self.names[:2]]
-        ax.imshow(
-            image.reshape(resolution, resolution, 3),
-            extent=extent,
-            origin="lower",
-            # A metre is as long to the right as it is upward.
-            aspect="equal" if units[0] and units[0] == units[1] else "auto",
-            interpolation="nearest",
-            zorder=0,
-        )
+        # A metre is as long to the right as it is upward.
+        aspect: Any = "equal" if units[0] and units[0] == units[1] else "auto"
+        image = image.reshape(resolution, resolution, 3)
+        ax.imshow(image, extent=extent, origin="lower", aspect=aspect, interpolation="nearest", zorder=0)
         ax.set(xlim=extent[:2], ylim=extent[2:], xlabel=self.names[0], ylabel=self.names[1])
         for axis, k in ((ax.xaxis, i), (ax.yaxis, j)):
             if math.isclose(self.period[k], 2 * math.pi, rel_tol=1e-4):
-                ticks = [-math.pi, -math.pi / 2, 0, math.pi / 2, math.pi]
                 labels = ["\u2212\u03c0", "\u2212\u03c0/2", "0", "\u03c0/2", "\u03c0"]
-                marks = [
-                    (t, s) for t, s in zip(ticks, labels, strict=True) if self.low[k] - 1e-3 <= t <= self.high[k] + 1e-3
-                ]
-                axis.set_ticks([t for t, _ in marks], [s for _, s in marks])
+                marks = {h * math.pi / 2: label for h, label in zip(range(-2, 3), labels, strict=True)}
+                shown_marks = {t: s for t, s in marks.items() if self.low[k] - 1e-3 <= t <= self.high[k] + 1e-3}
+                axis.set_ticks(list(shown_marks), list(shown_marks.values()))
 
-    def set_handles(self) -> list[Any]:
-        """Legend entries of the areas."""
+    def set_handles(self, *, beyond: bool = False) -> list[Any]:
+        """Legend entries of the areas, ``beyond``: of what lies outside the state space too."""
         patch = require("matplotlib.patches").Patch
-        pairs = ((self.safe_set, SAFE_FILL, "S"), (self.unsafe_set, UNSAFE_FILL, "U"))
-        return [patch(facecolor=c, edgecolor="#9a9a9a", linewidth=0.5, label=s) for r, c, s in pairs if r is not None]
+        areas = [("S", SAFE_FILL, self.safe_set is not None), ("U", UNSAFE_FILL, self.unsafe_set is not None)]
+        areas.append(("beyond the space", OUTSIDE_FILL, beyond))
+        return [patch(facecolor=c, edgecolor="#9a9a9a", linewidth=0.5, label=s) for s, c, drawn in areas if drawn]
 
     def grid(
         self, states: Any, values: dict[str, Any], reduce: str = "max"
@@ -286,14 +208,8 @@ class Plane:
             reduce: over the coordinates not shown: ``"max"`` takes the largest value and "for all" of booleans,
                 ``"min"`` the smallest and "for some"; a coordinate in ``fixed`` is taken at the nearest node instead.
 
-        Returns:
-            The two axes, ``(a,)`` and ``(b,)``, and the matrices ``(b, a)``.
-
-        Raises:
-            ShapeError: the states are not a full grid, or a value does not fit them.
-            ConfigError: ``reduce`` is not known.
-
-        Source: none.
+        Returns the two axes, ``(a,)`` and ``(b,)``, and the matrices ``(b, a)``. Raises ShapeError if the states are no
+        full grid, or a value does not fit them; ConfigError for another ``reduce``. Source: none.
         """
         if reduce not in ("max", "min"):
             raise ConfigError(f"reduce: expected 'max' or 'min', received {reduce!r}.")
@@ -303,8 +219,8 @@ class Plane:
         flat = np.ravel_multi_index(index, sizes)
         if math.prod(sizes) != len(x) or len(np.unique(flat)) != len(x):
             raise ShapeError(
-                f"states: expected all nodes of a regular grid, received {len(x)} states with {' x '.join(map(str, sizes))} "
-                "different coordinates; use state_space.grid(n)."
+                f"states: expected all nodes of a regular grid, received {len(x)} states with "
+                f"{' x '.join(map(str, sizes))} different coordinates; use state_space.grid(n)."
             )
         out = {}
         for name, value in values.items():
@@ -329,20 +245,13 @@ class Plane:
         return np.insert(path, np.nonzero(jump)[0] + 1, np.nan, axis=0)
 
 
+def line_handle(colour: str, label: str, style: str = "-") -> Any:
+    """Legend entry of a line."""
+    return require("matplotlib.lines").Line2D([], [], color=colour, linestyle=style, linewidth=1.8, label=label)
+
+
 def zero_level(ax: Axes, x: np.ndarray, y: np.ndarray, value: np.ndarray, **style: Any) -> Any | None:
-    """Contour line of a matrix at zero (of a bool: its border), or None where there is none.
-
-    Args:
-        ax: matplotlib axes.
-        x, y: ``(a,)`` and ``(b,)``.
-        value: ``(b, a)``.
-        style: colours, linewidths, ... of the line.
-
-    Returns:
-        The contour set, if the value changes its sign.
-
-    Source: none.
-    """
+    """Contour line of a matrix ``(b, a)`` at zero (of a bool: its border) over ``(a,)``, ``(b,)``; None without one."""
     level = 0.5 if value.dtype == bool else 0.0
     inside = value.astype(float) > level
     if not inside.any() or inside.all():

@@ -17,49 +17,38 @@ from typing import Any
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.viz.report_style import CSS
 
-NOT_MEASURED = "not measured"
+_NOT_MEASURED = "not measured"
 _MIME = {
-    ".png": "image/png",
-    ".jpg": "image/jpeg",
-    ".jpeg": "image/jpeg",
-    ".gif": "image/gif",
-    ".webp": "image/webp",
-    ".svg": "image/svg+xml",
-    ".mp4": "video/mp4",
-    ".webm": "video/webm",
-}
+    ".png": "image/png", ".jpg": "image/jpeg", ".jpeg": "image/jpeg", ".gif": "image/gif", ".webp": "image/webp",
+    ".svg": "image/svg+xml", ".mp4": "video/mp4", ".webm": "video/webm",
+}  # fmt: skip
 _ASSUMED = (
     "Measured figures hold for the distribution that they were sampled from, with the stated confidence: independent "
-    "states drawn uniformly from the named set, the simulator's dynamics and its pictures. A bound of a figure on a grid "
-    "reads the grid as if it were such a sample.",
+    "states drawn uniformly from the named set, the simulator's dynamics and its pictures. A bound of a figure on a "
+    "grid reads the grid as if it were such a sample.",
     "Nothing is said about other cameras, other physics or states outside the state space.",
 )
 
 
 def format_value(value: Any, unit: str = "") -> str:
-    """A figure for people: shares in per cent, four digits, "not measured" for None and NaN.
+    """A number, bool, text or None for people, not escaped: four digits, "not measured" for None and NaN.
 
-    Args:
-        value: number, bool, text or None.
-        unit: "share" prints per cent; other units are appended.
-
-    Returns:
-        The text, not escaped.
-
-    Source: none.
+    ``unit``: "share" prints per cent, others are appended. Source: none.
 
     Example:
         >>> format_value(0.0012, "share"), format_value(float("nan")), format_value(1.98765, "m")
         ('0.12 %', 'not measured', '1.988 m')
     """
     if value is None:
-        return NOT_MEASURED
+        return _NOT_MEASURED
     if hasattr(value, "item") and getattr(value, "shape", None) in ((), None):
         value = value.item()
-    if isinstance(value, bool) or not isinstance(value, (int, float)):
-        return {True: "yes", False: "no"}.get(value, str(value)) if isinstance(value, bool) else str(value)
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if not isinstance(value, (int, float)):
+        return str(value)
     if math.isnan(value):
-        return NOT_MEASURED
+        return _NOT_MEASURED
     if math.isinf(value):
         return "\u221e" if value > 0 else "\u2212\u221e"
     if unit == "share":
@@ -103,17 +92,9 @@ def _count(value: Any) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
-    """A table of cells that are HTML already; every cell knows its column, so that a phone can stack them.
+    """A table, HTML: titles of the columns as plain text, cells that are HTML already, and the class of the table.
 
-    Args:
-        head: titles of the columns, plain text.
-        rows: cells, HTML.
-        kind: class of the table.
-
-    Returns:
-        HTML.
-
-    Source: none.
+    Every cell knows its column, so that a phone can stack them. Source: none.
 
     Example:
         >>> '<td data-label="a">1</td>' in table(["a"], [["1"]])
@@ -142,37 +123,35 @@ _WORDS = {"aim": "aim reached", "must": "must reached"}
 
 
 def badge(verdict: str) -> str:
-    """A verdict as a coloured mark.
+    """A verdict as a coloured mark, HTML.
 
-    Args:
-        verdict: begins with "aim", "proved", "yes", "pass" (good), "must" (fair), "not measured", or anything else (bad).
-
-    Returns:
-        HTML.
-
-    Source: none.
+    It begins with "aim", "proved", "yes", "pass" (good), "must" (fair), "not measured", or anything else (bad). Source:
+    none.
 
     Example:
         >>> "good" in badge("proved"), "bad" in badge("missed by 2")
         (True, True)
     """
     kind = _verdict_kind(verdict)
-    text = _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or NOT_MEASURED)
+    text = _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or _NOT_MEASURED)
     return f'<span class="badge {kind}">{_BADGES[kind]}&nbsp;{escape(text)}</span>'
 
 
 def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple[str, Any, str, str, str]]:
-    """Rows of the summary from a table of requirements and an evaluation.
+    """Rows (label, measurement or None, must, aim, verdict) of the summary of ``write_report``.
 
     Args:
-        requirements: each with ``name``, ``label``, ``sense`` ("<=" or ">="), ``must``, ``aim`` and
-            ``verdict(evaluation)``.
+        requirements: each with ``name``, ``label``, ``sense``, ``must``, ``aim`` and ``verdict(evaluation)``, such as
+            :class:`~torchrl_sspl.envs.Requirement`.
         evaluation: has ``measurements`` by name.
 
-    Returns:
-        Rows (label, measurement or None, must, aim, verdict) for ``write_report``.
-
     Source: none.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> from torchrl_sspl.envs import Requirement
+        >>> requirement_rows([Requirement("a", "what", "<=", 0.1, 0.0)], SimpleNamespace(measurements={}))
+        [('what', None, '≤ 10 %', '0 %', 'not measured')]
     """
     rows = []
     for r in requirements:
@@ -182,11 +161,15 @@ def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple
         # Nothing lies below no event at all, nothing above all of them.
         end = {"<=": 0.0, ">=": 1.0 if unit == "share" else math.inf}[r.sense]
         limits = [f"{'' if v == end else sign + ' '}{format_value(v, unit)}" for v in (r.must, r.aim)]
-        verdict = r.verdict(evaluation)
-        if unit == "share" and verdict.startswith("missed by "):
-            verdict = f"missed by {format_value(float(verdict.removeprefix('missed by ')), 'share')}"
-        rows.append((r.label, m, limits[0], limits[1], verdict))
+        rows.append((r.label, m, *limits, verdict_in(unit, r.verdict(evaluation))))
     return rows
+
+
+def verdict_in(unit: str, verdict: str) -> str:
+    """A verdict "missed by x", in per cent where its unit is "share"."""
+    if unit != "share" or not verdict.startswith("missed by "):
+        return verdict
+    return f"missed by {format_value(float(verdict.removeprefix('missed by ')), unit)}"
 
 
 def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> tuple[str, str, str]:
@@ -198,22 +181,13 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
         label, value, must, aim, verdict = row
         value, m = _resolve(label, value, measurements)
         shown = format_value(value, m.get("unit", ""))
-        if shown == NOT_MEASURED:
-            verdict = NOT_MEASURED
+        if shown == _NOT_MEASURED:
+            verdict = _NOT_MEASURED
         kinds.append(_verdict_kind(verdict))
-        out.append(
-            [
-                escape(str(label)),
-                f"<b>{escape(shown)}</b>",
-                escape(_bound(m)),
-                escape(_count(m.get("n"))),
-                escape(format_value(must)),
-                escape(format_value(aim)),
-                badge(verdict),
-            ]
-        )
-    reached, missed, unknown = (sum(k in group for k in kinds) for group in (("good", "fair"), ("bad",), ("none",)))
-    aims = kinds.count("good")
+        numbers = (escape(text) for text in (_bound(m), _count(m.get("n")), format_value(must), format_value(aim)))
+        out.append([escape(str(label)), f"<b>{escape(shown)}</b>", *numbers, badge(verdict)])
+    aims, missed, unknown = (kinds.count(kind) for kind in ("good", "bad", "none"))
+    reached = aims + kinds.count("fair")
     if not rows:
         headline, kind = "No requirements were given", "none"
     elif missed:
@@ -232,20 +206,23 @@ def _data_uri(data: bytes, mime: str) -> str:
     return f"data:{mime};base64,{base64.b64encode(data).decode()}"
 
 
-def _file_uri(path: str | Path) -> tuple[str, str]:
+def file_uri(path: str | Path) -> str:
+    """A picture or film as an address that holds it."""
     path = Path(path)
     mime = _MIME.get(path.suffix.lower())
     if mime is None or not path.is_file():
         raise ConfigError(
             f"figure or video: expected an existing file of type {', '.join(_MIME)}, received '{path}'; draw it first."
         )
-    return _data_uri(path.read_bytes(), mime), mime
+    return _data_uri(path.read_bytes(), mime)
 
 
-def _media(uri: str, mime: str, alt: str) -> str:
-    if mime.startswith("video/"):
-        return f'<video controls loop muted playsinline preload="metadata" src="{uri}"></video>'
-    return f'<img alt="{escape(alt)}" src="{uri}">'
+def _shown(uri: str, alt: str, caption: str) -> str:
+    """A picture or film with its caption, which is HTML already."""
+    media = f'<img alt="{escape(alt)}" src="{uri}">'
+    if uri.startswith("data:video/"):
+        media = f'<video controls loop muted playsinline preload="metadata" src="{uri}"></video>'
+    return f"<figure>{media}<figcaption>{caption}</figcaption></figure>"
 
 
 def _figure(name: str, value: Any) -> str:
@@ -256,16 +233,15 @@ def _figure(name: str, value: Any) -> str:
     if hasattr(value, "savefig"):
         buffer = io.BytesIO()
         value.savefig(buffer, format="png", dpi=130)
-        uri, mime = _data_uri(buffer.getvalue(), "image/png"), "image/png"
+        uri = _data_uri(buffer.getvalue(), "image/png")
         caption = caption or str(value.get_label() or "")
     elif isinstance(value, (str, Path)):
-        uri, mime = _file_uri(value)
+        uri = file_uri(value)
     else:
         raise ConfigError(
             f"figures[{name!r}]: expected a matplotlib Figure or a path, received {type(value).__name__}."
         )
-    text = f"<b>{escape(name)}.</b> {escape(caption)}"
-    return f"<figure>{_media(uri, mime, caption or name)}<figcaption>{text}</figcaption></figure>"
+    return _shown(uri, caption or name, f"<b>{escape(name)}.</b> {escape(caption)}")
 
 
 def _flatten(config: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
@@ -276,10 +252,6 @@ def _flatten(config: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any
             value = asdict(value)
         rows += _flatten(value, f"{name}.") if isinstance(value, Mapping) and value else [(name, value)]
     return rows
-
-
-def _list(items: Sequence[str]) -> str:
-    return "<ul>" + "".join(f"<li>{escape(str(i))}</li>" for i in items) + "</ul>"
 
 
 def _measured_lines(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> list[str]:
@@ -335,36 +307,26 @@ def write_report(
     Args:
         path: file to write; its folder is created.
         title: what was trained.
-        summary: rows (label, value, must, aim, verdict). A value is a number, or a measurement with ``value``,
-            ``unit``, ``n``, ``events``, ``lower`` and ``upper``; a verdict starts with "aim", "must", "missed" or
-            "not measured". See ``requirement_rows``.
-        measurements: every measurement by name: mapping or dataclass with ``value``, ``unit``, ``n``, ``lower``,
-            ``upper``, ``note``.
+        summary: rows (label, value, must, aim, verdict), see ``requirement_rows``. A value is a number, or a
+            measurement with ``value``, ``unit``, ``n``, ``events``, ``lower`` and ``upper``; a verdict starts with
+            "aim", "must", "missed" or "not measured".
+        measurements: every measurement by name: mapping or dataclass as above, and with ``note``.
         figures: by name: a matplotlib Figure (its label is the caption), the path of a picture, or (either, caption).
         config: everything that determined the run, nested; its ``seed`` is named at the top.
         checks: held-out checks, one mapping or dataclass per round.
         certificate: section made by :func:`~torchrl_sspl.viz.certificate.certificate_section`.
-        video: mp4, webm or gif file.
-        video_caption: what it shows.
+        video, video_caption: mp4, webm or gif file, and what it shows.
         notes: text, in paragraphs separated by empty lines.
         headline: verdict and its kind ("good", "fair", "bad" or "none") where there is no summary.
         measured: what was measured, as sentences, where there is no summary.
         proved: statements that are proved. Never derived from the measurements: pass what a proof has returned.
         assumed: what both rest on; default: what holds for every sampled figure.
 
-    Returns:
-        The file.
-
-    Raises:
-        ShapeError: a row of the summary has not five entries.
-        ConfigError: a figure, video, measurement or check is not what was expected.
-
-    Source: none.
+    Returns the file. Raises ShapeError if a row of the summary has not five entries; ConfigError for a figure, video,
+    measurement or check that is not what was expected. Source: none.
 
     Example:
-        >>> import tempfile
-        >>> folder = tempfile.mkdtemp()
-        >>> page = write_report(folder + "/report.html", title="Demo", summary=[("a", 0.0, "0", "0", "aim")])
+        >>> page = write_report("report.html", title="Demo", summary=[("a", 0.0, "0", "0", "aim")])
         >>> "All requirements reached (1 of 1)" in page.read_text()
         True
     """
@@ -375,30 +337,33 @@ def write_report(
         first, kind = headline
     shown = _measured_lines(summary, data) or measured
     parts = [
-        f"<header><h1>{escape(title)}</h1><p class='facts'>{escape(' / '.join(_facts(config)))}</p></header>",
         _verdict(first, kind, proved, shown, _ASSUMED if assumed is None else assumed),
         _section("Requirements", rows_of_summary),
         certificate or "",
         _section("Notes", _paragraphs(notes)),
-        _section("Episode", "" if video is None else _film(video, video_caption)),
+        _section("Episode", "" if video is None else _shown(file_uri(video), video_caption, escape(video_caption))),
         _section("Figures", "".join(_figure(n, f) for n, f in (figures or {}).items())),
         _section("Held-out checks of every round", _sizes(checks) if checks else ""),
         _measurements(data) if data else "",
         _configuration(config) if config else "",
     ]
+    return write_page(path, title, " / ".join(_facts(config)), "".join(parts))
+
+
+def write_page(path: str | Path, title: str, facts: str, body: str, css: str = "") -> Path:
+    """Write, whole or not at all, a page with a title, a line of facts, a body that is HTML, and further styles."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(_page(title, "".join(parts)), encoding="utf-8")
-    return path
-
-
-def _page(title: str, body: str) -> str:
-    return (
+    part = path.with_name(path.name + ".part")
+    page = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{CSS}</style></head><body><main>{body}</main></body></html>\n"
+        f"<title>{escape(title)}</title><style>{CSS}{css}</style></head><body><main><header><h1>{escape(title)}</h1>"
+        f"<p class='facts'>{escape(facts)}</p></header>{body}</main></body></html>\n"
     )
+    part.write_text(page, encoding="utf-8")
+    return part.replace(path)
 
 
 def _verdict(text: str, kind: str, proved: Sequence[str], measured: Sequence[str], assumed: Sequence[str]) -> str:
@@ -408,10 +373,12 @@ def _verdict(text: str, kind: str, proved: Sequence[str], measured: Sequence[str
         ("Measured", measured or ["No share with a confidence bound."]),
         ("Assumed", assumed or ["Nothing stated."]),
     )
-    lists = "".join(f"<div><h3>{name}</h3>{_list(items)}</div>" for name, items in columns)
-    return (
-        f'<section class="verdict {kind}"><h2>{_BADGES[kind]} {escape(text)}</h2><div class="columns">{lists}</div></section>'
+    lists = "".join(
+        f"<div><h3>{name}</h3><ul>{''.join(f'<li>{escape(str(item))}</li>' for item in items)}</ul></div>"
+        for name, items in columns
     )
+    head = f"<h2>{_BADGES[kind]} {escape(text)}</h2>"
+    return f'<section class="verdict {kind}">{head}<div class="columns">{lists}</div></section>'
 
 
 def _facts(config: Mapping[str, Any]) -> list[str]:
@@ -430,23 +397,13 @@ def _paragraphs(notes: str) -> str:
     return "".join(f"<p>{escape(p)}</p>".replace("\n", "<br>") for p in found if p)
 
 
-def _film(path: str | Path, caption: str) -> str:
-    uri, mime = _file_uri(path)
-    return f"<figure>{_media(uri, mime, caption)}<figcaption>{escape(caption)}</figcaption></figure>"
-
-
 def _measurements(data: Mapping[str, dict[str, Any]]) -> str:
     """Every measurement with its bound, size and how it was made."""
-    cells = [
-        [
-            f"<code>{escape(n)}</code>",
-            escape(format_value(m.get("value"), m.get("unit", ""))),
-            escape(_bound(m)),
-            escape(_count(m.get("n"))),
-            escape(str(m.get("note", ""))),
-        ]
-        for n, m in data.items()
-    ]
+    cells = []
+    for name, m in data.items():
+        value, n = format_value(m.get("value"), m.get("unit", "")), _count(m.get("n"))
+        texts = (escape(text) for text in (value, _bound(m), n, str(m.get("note", ""))))
+        cells.append([f"<code>{escape(name)}</code>", *texts])
     body = table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
     return f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>"
 

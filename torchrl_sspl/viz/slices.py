@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -10,8 +11,16 @@ import numpy as np
 import torch
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.viz.figures import _line
-from torchrl_sspl.viz.plane import BARRIER_COLOUR, KERNEL_COLOUR, PATH_COLOURS, Plane, array, new_figure, zero_level
+from torchrl_sspl.viz.plane import (
+    BARRIER_COLOUR,
+    KERNEL_COLOUR,
+    PATH_COLOURS,
+    Plane,
+    array,
+    line_handle,
+    new_figure,
+    zero_level,
+)  # fmt: skip
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -29,7 +38,7 @@ def slices(
     values: Sequence[float] | None = None,
     arrows: bool = True,
 ) -> Figure:
-    """The plane for several values of a third, periodic coordinate: S, U, the buffer, the line B = 0, the true kernel's border.
+    """The plane for several values of a third, periodic coordinate: S, U, the line B = 0, the true kernel's border.
 
     Args:
         plane: the first two coordinates, with S and U.
@@ -40,30 +49,23 @@ def slices(
         values: of the third coordinate, in rad; the nearest of the grid is shown. Default: eight of them.
         arrows: the third coordinate is a direction in the plane: show it.
 
-    Returns:
-        The figure; its label is a caption.
-
-    Raises:
-        ShapeError, NonFiniteError: the states are not a full grid, or a value does not fit them.
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Section V, figure "traj_sspl_gr"; deviation: the level of B and the true kernel are added.
+    Raises ShapeError or NonFiniteError if the states are no full grid, or a value does not fit them. Source: paper
+    Section V, figure "traj_sspl_gr"; deviation: the level of B and the true kernel are added.
 
     Example:
-        >>> from torchrl_sspl.sets import Box
-        >>> space = Box([-2.0, -2.0, -3.14], [2.0, 2.0, 3.14])
-        >>> states = space.grid([9, 9, 4])
-        >>> plane = Plane(("x", "y"), space.low.tolist(), space.high.tolist())
+        >>> plane = Plane(("x", "y"), [-2, -2, -3], [2, 2, 3])
+        >>> states = torch.cartesian_prod(torch.arange(-2.0, 3), torch.arange(-2.0, 3), torch.arange(-3.0, 3))
         >>> len(slices(plane, states, 1.0 - states[:, :2].norm(dim=-1), values=[0.0, 1.0]).axes)
         2
     """
-    angles = [math.remainder(v, 2 * math.pi) for v in ([k * math.pi / 4 for k in range(8)] if values is None else values)]
+    values = [k * math.pi / 4 for k in range(8)] if values is None else values
+    angles = [math.remainder(v, 2 * math.pi) for v in values]
     word = name.partition(" [")[0]
     columns = min(4, len(angles))
     rows = math.ceil(len(angles) / columns)
     caption = (
-        f"What is called safe at a given {word}{' (arrow)' if arrows else ''}: the side of the black line, on which B = 0, where S "
-        "lies. Green: S, red: U, white: the buffer without labels."
+        f"What is called safe at a given {word}{' (arrow)' if arrows else ''}: the side of the black line, on which "
+        "B = 0, where S lies. Green: S, red: U, white: the buffer without labels."
     )
     tables = {"barrier": barrier}
     if viability is not None:
@@ -73,7 +75,7 @@ def slices(
     figure = new_figure(3.1 * columns, 3.2 * rows + 0.4, caption)
     for k, angle in enumerate(angles):
         ax = figure.add_subplot(rows, columns, k + 1)
-        cut = Plane(plane.names, plane.low, plane.high, plane.period, plane.safe_set, plane.unsafe_set, (0, 1), {2: angle})
+        cut = dataclasses.replace(plane, coords=(0, 1), fixed={2: angle})
         cut.draw(ax, resolution=200)
         x, y, table = cut.grid(states, tables)
         zero_level(ax, x, y, table["barrier"], colors=BARRIER_COLOUR, linewidths=1.6)
@@ -83,9 +85,9 @@ def slices(
             _draw_direction(ax, plane, angle)
         ax.set(title=f"{word} {math.degrees(angle):.0f}\u00b0", aspect="equal" if arrows else "auto")
         ax.label_outer()
-    handles = [*plane.set_handles(), _line(BARRIER_COLOUR, "B = 0")]
+    handles = [*plane.set_handles(), line_handle(BARRIER_COLOUR, "B = 0")]
     if viability is not None:
-        handles.append(_line(KERNEL_COLOUR, "true kernel", "--"))
+        handles.append(line_handle(KERNEL_COLOUR, "true kernel", "--"))
     figure.legend(handles=handles, loc="outside lower center", ncols=len(handles), frameon=False)
     return figure
 
@@ -110,20 +112,12 @@ def walks(plane: Plane, states: Any, alive: Any, wrong: Any, *, limit: int = 60,
         limit: paths drawn at most; those that went wrong first.
         caption: what is shown.
 
-    Returns:
-        The figure; its label is a caption.
-
-    Raises:
-        ConfigError: there is no episode.
-        ShapeError, NonFiniteError: an argument is not what was expected.
-        MissingDependencyError: matplotlib is not installed.
-
-    Source: paper Section V, figure "traj_sspl_gr"; deviation: the paths of all episodes, not of a few.
+    Raises ConfigError without any episode; ShapeError or NonFiniteError for arguments that do not fit. Source: paper
+    Section V, figure "traj_sspl_gr"; deviation: the paths of all episodes, not of a few.
 
     Example:
         >>> plane = Plane(("x", "y"), [-2, -2, -3], [2, 2, 3])
-        >>> figure = walks(plane, torch.zeros(3, 1, 3), torch.ones(3, 1).bool(), torch.zeros(1).bool())
-        >>> figure.axes[0].get_xlabel()
+        >>> walks(plane, torch.zeros(3, 1, 3), torch.ones(3, 1).bool(), [False]).axes[0].get_xlabel()
         'x'
     """
     held = array("alive", alive, (None, None)).astype(bool)
@@ -145,9 +139,6 @@ def walks(plane: Plane, states: Any, alive: Any, wrong: Any, *, limit: int = 60,
         ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.0)
         ax.plot(*path[0], "o", color=colour, markersize=4, markeredgecolor="white")
     ax.set_aspect("equal")
-    handles = [*plane.set_handles(), _line(_WRONG, f"went wrong ({len(worse)})")]
+    handles = [*plane.set_handles(), line_handle(_WRONG, f"went wrong ({len(worse)})")]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure
-
-
-__all__ = ["slices", "walks"]

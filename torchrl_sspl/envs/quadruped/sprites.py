@@ -67,8 +67,9 @@ def load_sprites(path: str | Path = _SPRITE_FILE) -> Sprites:
     n = len(sprites.postures)
     if sprites.colours.shape != (n, *sprites.heights.shape[1:], 3) or sprites.postures.shape != (n, 22) or n < 1:
         raise CheckpointError(
-            f"sprites: expected colours (n, size, size, 3), heights (n, size, size) and postures (n, 22) in {path}, received "
-            f"{sprites.colours.shape}, {sprites.heights.shape}, {sprites.postures.shape}; reinstall the package."
+            f"sprites: expected colours (n, size, size, 3), heights (n, size, size) and postures (n, 22) in {path}, "
+            f"received {sprites.colours.shape}, {sprites.heights.shape}, {sprites.postures.shape}; "
+            "reinstall the package."
         )
     return sprites
 
