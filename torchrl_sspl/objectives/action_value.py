@@ -108,6 +108,3 @@ class ActionValueLoss(LatentLoss):
         action = self._run("actor_network", batch.latent)
         short = table.amax(-1, keepdim=True) - interpolate(table, action, action_scale=self.action_scale)
         return {"loss_action_value": self._reduce(short / self.scale, batch, worst=True)}
-
-
-__all__ = ["ActionValueLoss", "interpolate"]

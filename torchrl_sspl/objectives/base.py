@@ -111,9 +111,9 @@ def _same(held: Tensor | None, value: Tensor) -> bool:
     return held is value or (held is not None and not value.requires_grad and held.data_ptr() == value.data_ptr())
 
 
-def _clean(value: Tensor, valid: Tensor | None) -> Tensor:
+def _clean(value: Any, valid: Tensor | None) -> Any:
     """Zero in the rows that do not count: a masked NaN behind a network still poisons its gradients."""
-    if valid is None or not value.is_floating_point():
+    if value is None or valid is None or not value.is_floating_point():
         return value
     shape = valid.shape[:-1] + (1,) * (value.ndim - valid.ndim + 1)
     return torch.where(valid.reshape(shape), value, 0.0)
@@ -327,11 +327,8 @@ class LatentLoss(LossModule):
                 finally:
                     for where, leaf, value in learnt:
                         where[leaf] = value
-        if params == "target":
-            values = getattr(self, f"target_{name}_params")
-        else:
-            values = getattr(self, f"{name}_params")
-            values = values.data if params == "frozen" else values
+        values = getattr(self, f"target_{name}_params" if params == "target" else f"{name}_params")
+        values = values.data if params == "frozen" else values
         # preserve_module_state=False keeps delayed copies from becoming trainable; the context manager
         # of to_module would leave the copies in the module, which is also the rollout policy, if the
         # body raised.
@@ -390,8 +387,7 @@ class LatentLoss(LossModule):
         latents = self._encode(tensordict, valid, True, "next_latent" in needs, "online")
         batch = LatentBatch(latents[0], valid=valid)
         if "residual" in needs:
-            residual = tensordict.get(keys.residual, None)
-            batch.residual = None if residual is None else _clean(residual, valid)
+            batch.residual = _clean(tensordict.get(keys.residual, None), valid)
         if "next_latent" in needs:
             batch.next_latent = latents[1]
         now, after = "target_latent" in needs, "target_next_latent" in needs
@@ -401,7 +397,7 @@ class LatentLoss(LossModule):
             batch.target_latent = latents[0] if now else batch.target_latent
             batch.target_next_latent = latents[-1] if after else batch.target_next_latent
         if "action" in self._needs:
-            batch.action = _clean(self._get(tensordict, keys.action, "action"), valid)
+            batch.action = self._counted(tensordict, keys.action, "action", batch)
             if batch.action.shape[:-1] != batch.shape:
                 raise ShapeError(
                     f"expected {keys.action!r} of shape (*{tuple(batch.shape)}, action_dim), received "

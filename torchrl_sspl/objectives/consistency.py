@@ -62,6 +62,3 @@ class ConsistencyLoss(LatentLoss):
             "dynamics_error": norm.mean() if batch.valid is None else norm.sum() / batch.valid.sum().clamp_min(1),
             "dynamics_error_max": norm.max(),
         }
-
-
-__all__ = ["ConsistencyLoss"]
