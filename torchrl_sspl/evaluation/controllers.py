@@ -31,7 +31,7 @@ class Decision:
 
     def _map(self, function: Callable[[Tensor, str], Tensor]) -> Decision:
         values = {f.name: getattr(self, f.name) for f in fields(self)}
-        return Decision(**{k: None if v is None else function(v, k) for k, v in values.items()})
+        return Decision(**{k: function(v, k) for k, v in values.items() if v is not None})
 
     def rows(self, rows: Tensor | None) -> Decision:
         """Those of some of the episodes; of all, if None."""
@@ -204,7 +204,7 @@ class _FunctionController:
             raise ShapeError(
                 f"controller: expected one action (and barrier value) for each of {n} observations, received {shapes}"
             )
-        return Decision(action.reshape(n, -1), barrier if barrier is None else barrier.reshape(n).float().cpu())
+        return Decision(action.reshape(n, -1), _NONE if barrier is None else barrier.reshape(n).float().cpu())
 
 
 class RandomController:
