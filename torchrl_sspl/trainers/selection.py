@@ -20,7 +20,7 @@ from torchrl_sspl.trainers.phases import Check, Phase, Workspace
 _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
 _LOWEST_LEVEL = -0.2
 _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away from what the set tolerates
-_UNSAFE_DRAWS = 32_000  # fresh observations of U, at most
+_UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
 _BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
 
 
@@ -39,7 +39,7 @@ class CheckRound(Phase):
     """Held-out checks of a round; the level is moved to the largest set that passes them.
 
     The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations
-    of U for every episode, 32,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim,
+    of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim,
     in the first steps, so many short episodes say more than few long ones. Source: none; the paper stops at a total
     loss of zero.
     """
