@@ -14,7 +14,7 @@ import time
 import torch
 
 from torchrl_sspl.envs.quadruped.compositor import TopViewCompositor
-from torchrl_sspl.envs.quadruped.renderer import BulletRenderer
+from torchrl_sspl.envs.quadruped.sprites import BulletRenderer
 from torchrl_sspl.sets import Box
 
 BATCH = 250

@@ -22,7 +22,7 @@ def poses(n: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
 @pytest.mark.pybullet
 def test_frames_agree_with_the_renderer():
     pytest.importorskip("pybullet")
-    from torchrl_sspl.envs.quadruped.renderer import BulletRenderer
+    from torchrl_sspl.envs.quadruped.sprites import BulletRenderer
 
     pose, phase = poses(150, seed=7)
     reference = BulletRenderer()(pose, phase)

@@ -10,12 +10,6 @@ from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
 from torchrl_sspl.envs.system import Requirement, System
 
 __all__ = [
-    "DubinsEnv",
-    "GymnasiumPixels",
-    "GymnasiumRenderer",
-    "PendulumEnv",
-    "PendulumRenderer",
-    "Requirement",
-    "SafetyEnv",
+    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "PendulumEnv", "PendulumRenderer", "Requirement", "SafetyEnv",
     "System",
-]
+]  # fmt: skip

@@ -44,12 +44,8 @@ _PHYSICS = (
 class Disc(Region):
     r"""States whose first two coordinates lie in a disc, :math:`\|(x, y) - c\| \le r`.
 
-    Args:
-        centre, radius: (x, y), and a positive number, in m.
-        rest: values of the other coordinates when states are drawn; membership does not depend on them. None: the
-            states are (x, y).
-
-    Source: none.
+    Centre and radius are in m; ``rest`` are the values of the other coordinates when states are drawn, on which
+    membership does not depend; None: the states are (x, y). Source: none.
 
     Example:
         >>> Disc([0.0, 0.0], 1.0).contains(torch.tensor([[0.6, 0.6], [0.8, 0.8]]))

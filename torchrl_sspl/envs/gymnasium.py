@@ -61,8 +61,7 @@ class GymnasiumPixels(EnvBase):
         settle: let one step pass after a reset.
         ignore_termination: let episodes go on where gymnasium ends them, up to ``horizon``: where it ends them in U, no
             transition would start there. The system has to bear it (those of gymnasium do, with a warning).
-        device: device of the tensors.
-        seed: seed of the resets.
+        device, seed: device of the tensors, and seed of the resets.
 
     Raises ConfigError if the environment cannot draw itself, or its action space is neither a bounded ``Box`` nor
     ``Discrete``; OverlapError, during a run, if both predicates claim a state. Source: none; the paper has two systems

@@ -1,4 +1,4 @@
-"""Figures, films and reports of a run; needs the extra ``viz`` (matplotlib, imageio-ffmpeg) when used, not when imported."""
+"""Figures, films and reports of a run; the extra ``viz`` (matplotlib, imageio-ffmpeg) is needed when they are used."""
 
 from torchrl_sspl.viz.animation import animate
 from torchrl_sspl.viz.curves import read_log, training_curves
@@ -8,17 +8,6 @@ from torchrl_sspl.viz.report import format_value, requirement_rows, write_report
 from torchrl_sspl.viz.slices import slices, walks
 
 __all__ = [
-    "Plane",
-    "animate",
-    "format_value",
-    "frames",
-    "latent_space",
-    "read_log",
-    "requirement_rows",
-    "slices",
-    "state_plane",
-    "training_curves",
-    "trajectories",
-    "walks",
-    "write_report",
-]
+    "Plane", "animate", "format_value", "frames", "latent_space", "read_log", "requirement_rows", "slices",
+    "state_plane", "training_curves", "trajectories", "walks", "write_report",
+]  # fmt: skip

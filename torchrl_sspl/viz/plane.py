@@ -40,14 +40,7 @@ def require(module: str) -> Any:
 
 
 def new_figure(width: float, height: float, caption: str = "") -> Figure:
-    """Empty figure of a size in inches, outside pyplot's global state; its label is the caption that a report prints.
-
-    Source: none.
-
-    Example:
-        >>> new_figure(4, 3, "Nothing yet.").get_label()
-        'Nothing yet.'
-    """
+    """Empty figure of a size in inches, outside pyplot's global state; its label is the caption of a report."""
     agg = require("matplotlib.backends.backend_agg")
     figure = require("matplotlib.figure").Figure(figsize=(width, height), layout="constrained", facecolor="white")
     agg.FigureCanvasAgg(figure)
@@ -58,11 +51,7 @@ def new_figure(width: float, height: float, caption: str = "") -> Figure:
 def array(name: str, value: Any, shape: tuple[int | None, ...], *, finite: bool = True) -> np.ndarray:
     """Values (tensor, array or nested list) as a float64 or bool array of a given shape (None: any size).
 
-    ShapeError, DTypeError and NonFiniteError call them ``name``; ``finite``: refuse NaN and infinity. Source: none.
-
-    Example:
-        >>> array("x", [[1, 2]], (None, 2)).shape
-        (1, 2)
+    ShapeError, DTypeError and NonFiniteError call them ``name``; ``finite``: refuse NaN and infinity.
     """
     try:
         tensor = torch.as_tensor(value).detach().cpu()

@@ -92,14 +92,7 @@ def _count(value: Any) -> str:
 
 
 def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
-    """A table, HTML: titles of the columns as plain text, cells that are HTML already, and the class of the table.
-
-    Every cell knows its column, so that a phone can stack them. Source: none.
-
-    Example:
-        >>> '<td data-label="a">1</td>' in table(["a"], [["1"]])
-        True
-    """
+    """A table as HTML, of cells that are HTML already; every cell knows its column, so that a phone can stack them."""
     top = "".join(f'<th scope="col">{escape(h)}</th>' for h in head)
     body = "".join(
         "<tr>" + "".join(f'<td data-label="{escape(h)}">{c}</td>' for h, c in zip(head, row, strict=True)) + "</tr>"
@@ -123,15 +116,7 @@ _WORDS = {"aim": "aim reached", "must": "must reached"}
 
 
 def badge(verdict: str) -> str:
-    """A verdict as a coloured mark, HTML.
-
-    It begins with "aim", "proved", "yes", "pass" (good), "must" (fair), "not measured", or anything else (bad). Source:
-    none.
-
-    Example:
-        >>> "good" in badge("proved"), "bad" in badge("missed by 2")
-        (True, True)
-    """
+    """A verdict ("aim", "proved", "yes", "pass": good; "must": fair; "not measured"; else bad) as a mark in HTML."""
     kind = _verdict_kind(verdict)
     text = _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or _NOT_MEASURED)
     return f'<span class="badge {kind}">{_BADGES[kind]}&nbsp;{escape(text)}</span>'
@@ -140,11 +125,7 @@ def badge(verdict: str) -> str:
 def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple[str, Any, str, str, str]]:
     """Rows (label, measurement or None, must, aim, verdict) of the summary of ``write_report``.
 
-    Args:
-        requirements: each with ``name``, ``label``, ``sense``, ``must``, ``aim`` and ``verdict(evaluation)``, such as
-            :class:`~torchrl_sspl.envs.Requirement`.
-        evaluation: has ``measurements`` by name.
-
+    Requirements are such as :class:`~torchrl_sspl.envs.Requirement`; the evaluation has ``measurements`` by name.
     Source: none.
 
     Example:

@@ -107,8 +107,7 @@ def walks(plane: Plane, states: Any, alive: Any, wrong: Any, *, limit: int = 60,
     Args:
         plane: the coordinates shown.
         states: ``(T + 1, n, dim)`` true states.
-        alive: ``(T + 1, n)`` whether a state belongs to its episode.
-        wrong: ``(n,)`` whether an episode went wrong.
+        alive, wrong: ``(T + 1, n)`` whether a state belongs to its episode, ``(n,)`` whether an episode went wrong.
         limit: paths drawn at most; those that went wrong first.
         caption: what is shown.
 

@@ -32,17 +32,12 @@ class RenderError(SSPLError, RuntimeError):
 
 
 class TopCamera:
-    """Frames of a PyBullet world from far above, x to the right and y up.
+    """Frames of a PyBullet world from far above, x to the right and y up, ``image_size`` pixels high and wide.
 
-    Args:
-        client: PyBullet client.
-        image_size: height and width of the frames, in pixels.
-        half_view: distance from the middle of the frame to its edge, on the ground, in m.
-        centre: what lies in the middle of the frame, (x, y) in m.
-        supersample: how many times larger a frame is drawn before it is area-averaged.
-
-    Raises ConfigError unless the image size is at least 8. Source: paper, Section IV-B (top view of the x-y
-    plane, 128 x 128 RGB); deviation: none.
+    ``half_view``: distance from the middle of the frame to its edge, on the ground, in m; ``centre``: what lies in the
+    middle, (x, y) in m; ``supersample``: how many times larger a frame is drawn before it is area-averaged. Raises
+    ConfigError unless the image size is at least 8. Source: paper, Section IV-B (top view of the x-y plane, 128 x 128
+    RGB); deviation: none.
     """
 
     def __init__(

@@ -90,10 +90,7 @@ class WalkingController:
     towards the arc of the trot that ends at its foothold. Commands are slew limited, without which sudden changes
     of the yaw rate make the robot fall; integrators on velocity and heading remove what the model misses.
 
-    Args:
-        body: mass distribution of the whole robot, standing.
-        dt: time between calls of ``torques``, in s.
-        solver: quadratic program solver.
+    ``body`` is the mass distribution of the whole robot, standing, ``dt`` the time between calls of ``torques`` in s.
 
     Source: Di Carlo et al. (2018). Deviation: slew limits and integrators.
 
@@ -118,15 +115,9 @@ class WalkingController:
         if memory is None:
             feet = measured.position + forward_kinematics(measured.joints)[0] @ measured.rotation.T
             memory = Memory(
-                steps=0,
-                command=np.zeros(3),
-                heading=float(measured.roll_pitch_yaw[2]),
-                integral=np.zeros(2),
-                forces=np.zeros((4, 3)),
-                footholds=feet,
-                lift_off=feet,
-                standing=np.ones(4, bool),
-            )
+                steps=0, command=np.zeros(3), heading=float(measured.roll_pitch_yaw[2]), integral=np.zeros(2),
+                forces=np.zeros((4, 3)), footholds=feet, lift_off=feet, standing=np.ones(4, bool),
+            )  # fmt: skip
         self.memory = memory
         self.mpc.reset(memory.forces)
 

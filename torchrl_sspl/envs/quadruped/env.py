@@ -36,17 +36,11 @@ class QuadrupedEnv(gymnasium.Env):
     ============= ===========================================================================================
 
     Args:
-        max_yaw_rate: bound of the action, rad/s; what lies beyond is clipped.
-        speed: forward velocity, m/s.
-        dt: time of one step, s.
-        image_size: height and width of the frames, pixels.
-        arena_half_size: half of the arena's edge, m.
-        safe_half_size: S lies outside the square of this half edge around the obstacle, m.
-        unsafe_half_size: half edge, or radius, of U around the obstacle, m.
-        obstacle_shape: "square" or "disc".
-        obstacle_half_size: half edge, or radius, of the obstacle itself, m. Feet reach 0.35 m from the base: up to 0.3
-            m nothing touches it while the base is outside U.
-        obstacle_centre: (x, y), m.
+        max_yaw_rate, speed, dt, image_size: bound of the action (what lies beyond is clipped), speed and step as of
+            :class:`~torchrl_sspl.envs.DubinsEnv`.
+        arena_half_size, safe_half_size, unsafe_half_size, obstacle_shape, obstacle_half_size, obstacle_centre: as of
+            ``DubinsEnv``. Feet reach 0.35 m from the base: up to an obstacle of 0.3 m nothing touches it while the base
+            is outside U.
         meshes: draw the robot's meshes (thirty times slower); agents are trained on the plain shapes.
         render_mode: "rgb_array", "human" (a window) or None.
 

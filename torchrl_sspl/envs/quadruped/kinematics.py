@@ -80,12 +80,7 @@ def rotation_z(angle: float) -> Array:
 
 
 def skew(vectors: Array) -> Array:
-    """Cross-product matrices ``(*batch, 3, 3)`` of vectors ``(*batch, 3)``: ``skew(a) @ b = a x b``.
-
-    Example:
-        >>> (skew(np.array([1.0, 2.0, 3.0])) @ [4.0, 5.0, 6.0]).tolist()
-        [-3.0, 6.0, -3.0]
-    """
+    """Cross-product matrices ``(*batch, 3, 3)`` of vectors ``(*batch, 3)``: ``skew(a) @ b = a x b``."""
     out = np.zeros((*vectors.shape, 3))
     x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
     out[..., 0, 1], out[..., 0, 2] = -z, y

@@ -56,10 +56,7 @@ class ConvexMPC:
     Every solution is checked: the solver's status, finite numbers, and the constraints. Where a check fails the forces
     of the last good solution are held and ``failures`` counts it; many in a row raise a SolverError.
 
-    Args:
-        mass: in kg.
-        inertia: ``(3, 3)`` about the centre of mass in the base frame, in kg m^2.
-        solver: quadratic program solver, with the signature of ``solve_daqp``.
+    ``mass`` in kg, ``inertia`` ``(3, 3)`` about the centre of mass in the base frame in kg m^2.
 
     Source: Di Carlo et al. (2018), "Dynamic locomotion in the MIT Cheetah 3 through convex model-predictive control".
     Deviation: forces enter positions and angles within their own step (second order in dt).
@@ -75,8 +72,7 @@ class ConvexMPC:
     """
 
     def __init__(self, mass: float, inertia: Array, solver: Solver = solve_daqp) -> None:
-        self.failures, self.solves = 0, 0
-        self._in_a_row = 0
+        self.failures, self.solves, self._in_a_row = 0, 0, 0
         self._mass, self._inverse_inertia, self._solver = mass, np.linalg.inv(inertia), solver
         self._last = np.zeros((4, 3))
         # Steps that a force at step j has acted on x_k, k = j + 1, ..., horizon: velocities see all of them,
@@ -93,13 +89,10 @@ class ConvexMPC:
     def solve(self, state: Array, reference: Array, feet: Array, contacts: Mask) -> Array:
         """Forces of the ground on the feet until the next call, ``(4, 3)`` in N; zero for feet that swing.
 
-        Args:
-            state: ``(12,)``, yaw 0.
-            reference: ``(HORIZON, 12)`` for the ends of the steps.
-            feet: ``(HORIZON, 4, 3)`` from the centre of mass of the reference, at the beginnings of the steps, in m.
-            contacts: bool ``(HORIZON, 4)``, which feet stand.
-
-        Raises NonFiniteError for NaN or infinity; SolverError without a valid solution many times in a row.
+        The state is ``(12,)`` with yaw 0; the reference ``(HORIZON, 12)`` is for the ends of the steps; feet
+        ``(HORIZON, 4, 3)`` in m, from the centre of mass of the reference, and contacts ``(HORIZON, 4)``, bool, for
+        their beginnings. Raises NonFiniteError for NaN or infinity; SolverError without a valid solution many times in
+        a row.
         """
         if not (np.isfinite(state).all() and np.isfinite(reference).all() and np.isfinite(feet).all()):
             raise NonFiniteError(

@@ -27,15 +27,10 @@ class Snapshot:
 
 
 class WalkingRobot:
-    """An A1 on level ground that walks as it is told.
+    """An A1 on level ground that walks as it is told, in the world of a PyBullet client from ``connect``.
 
-    Args:
-        client: PyBullet client, from ``connect``; gravity and time step are set here.
-        dt: time step of physics and control, in s.
-        solver: quadratic program solver of the controller.
-        meshes: draw the robot's meshes.
-
-    Raises MissingDependencyError without PyBullet's data or daqp.
+    Gravity and the time step ``dt`` (s) are set here; ``meshes``: draw the robot's meshes. Raises
+    MissingDependencyError without PyBullet's data or daqp.
     """
 
     def __init__(self, client: Any, *, dt: float = 0.002, solver: Solver = solve_daqp, meshes: bool = False) -> None:

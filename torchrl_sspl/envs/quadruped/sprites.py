@@ -14,13 +14,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from torchrl_sspl.envs.quadruped.camera import TopCamera
 from torchrl_sspl.envs.quadruped.controller import Measurement
 from torchrl_sspl.envs.quadruped.gait import PERIOD
 from torchrl_sspl.envs.quadruped.kinematics import rotation_z
-from torchrl_sspl.errors import CheckpointError
+from torchrl_sspl.envs.quadruped.robot import WalkingRobot
+from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
+from torchrl_sspl.errors import CheckpointError, ShapeError
 
 TEXEL = 0.0025  # m on the ground under the camera, size of a texel of a sprite
 HEIGHT_UNIT = 0.002  # m, of the heights of a sprite
@@ -89,8 +93,6 @@ def _posture_of(measured: Measurement) -> NDArray[np.float32]:
 
 def draw_sprites(client: Any) -> Sprites:
     """Walk straight ahead at 1 m/s in the empty world of a PyBullet client and draw the robot at phases of its gait."""
-    from torchrl_sspl.envs.quadruped.robot import WalkingRobot
-
     robot = WalkingRobot(client)
     interval = round(PERIOD / robot.dt) // _PHASES
     postures = np.stack([_posture_of(s.measured) for s in robot.steady_gait(interval)])
@@ -106,10 +108,38 @@ def draw_sprites(client: Any) -> Sprites:
     return Sprites(np.stack(colours), np.stack(heights), postures)
 
 
+class BulletRenderer:
+    """The reference for the compositor: robots beside a square obstacle, at rest in a steady gait, about 2 ms each.
+
+    ``image_size``: height and width of the frames, in pixels. Source: paper, Section IV-B (frames from PyBullet);
+    deviation: none. Raises MissingDependencyError without PyBullet.
+    """
+
+    def __init__(self, image_size: int = 128) -> None:
+        self._client = connect()
+        self._robot = WalkingRobot(self._client)
+        add_obstacle(self._client, "square", 0.3, (0.0, 0.0))
+        self._camera = TopCamera(self._client, image_size)
+        self._postures = load_sprites().postures
+
+    def __call__(self, pose: Tensor, phase: Tensor | None = None) -> Tensor:
+        """Draw poses ``(n, 3)`` (m, m, rad) at gait phases ``(n,)``, uint8 ``(n, 3, H, W)``.
+
+        Raises ShapeError for other shapes; RenderError if a robot is not in the frame.
+        """
+        if pose.ndim != 2 or pose.shape[1] != 3:
+            raise ShapeError(f"pose: expected shape (n, 3), received {tuple(pose.shape)}.")
+        phases = torch.zeros(len(pose)) if phase is None else phase
+        n = len(self._postures)
+        frames = []
+        for (x, y, heading), k in zip(pose.tolist(), torch.round(phases * n).long().tolist(), strict=True):
+            self._robot.pose_as(posture_at(self._postures[k % n], x, y, heading))
+            frames.append(torch.from_numpy(self._camera.capture(self._robot.body_id)))
+        return torch.stack(frames).permute(0, 3, 1, 2).contiguous()
+
+
 def _main() -> None:
     """Draw the sprites of the package."""
-    from torchrl_sspl.envs.quadruped.world import connect
-
     path = Path(sys.argv[1]) if len(sys.argv) > 1 else _SPRITE_FILE
     draw_sprites(connect()).save(path)
     print(f"{path}: {path.stat().st_size / 1e3:.0f} kB")
