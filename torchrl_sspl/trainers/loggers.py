@@ -122,7 +122,8 @@ def wandb_offline() -> bool:
     mode = os.environ.get("WANDB_MODE", "").lower()
     if mode:
         return mode in ("offline", "dryrun", "disabled")
-    host, _, port = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0].partition(":")
+    server = os.environ.get("WANDB_BASE_URL", "https://api.wandb.ai").split("//")[-1].split("/")[0]
+    host, _, port = server.partition(":")
     if not (os.environ.get("WANDB_API_KEY") or _stored_key(host)):
         return True
     try:
