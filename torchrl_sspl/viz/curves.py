@@ -98,7 +98,7 @@ def _draw_losses(ax: Axes, rows: list[dict[str, Any]]) -> None:
 
 
 def _legend_below(ax: Axes) -> None:
-    place = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2), "ncols": 3}
+    place: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.2), "ncols": 3}
     ax.legend(fontsize=7, frameon=False, labelspacing=0.25, columnspacing=1.0, handlelength=1.4, **place)
 
 

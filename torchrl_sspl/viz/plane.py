@@ -169,8 +169,8 @@ class Plane:
         units = [name.partition("[")[2] for name in self.names[:2]]
         # A metre is as long to the right as it is upward.
         aspect: Any = "equal" if units[0] and units[0] == units[1] else "auto"
-        image = image.reshape(resolution, resolution, 3)
-        ax.imshow(image, extent=extent, origin="lower", aspect=aspect, interpolation="nearest", zorder=0)
+        square = image.reshape(resolution, resolution, 3)
+        ax.imshow(square, extent=extent, origin="lower", aspect=aspect, interpolation="nearest", zorder=0)
         ax.set(xlim=extent[:2], ylim=extent[2:], xlabel=self.names[0], ylabel=self.names[1])
         for axis, k in ((ax.xaxis, i), (ax.yaxis, j)):
             if math.isclose(self.period[k], 2 * math.pi, rel_tol=1e-4):

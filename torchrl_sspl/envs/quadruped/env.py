@@ -54,7 +54,7 @@ class QuadrupedEnv(gymnasium.Env):
         >>> pixels, reward, terminated, truncated, info = env.step(np.array([0.5]))  # doctest: +SKIP
     """
 
-    metadata: ClassVar = {"render_modes": ["human", "rgb_array"], "render_fps": 10}
+    metadata: ClassVar = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # type: ignore[misc]
     _gait: ClassVar[list[Snapshot]] = []
 
     def __init__(

@@ -86,8 +86,9 @@ class WalkingRobot:
         angle = heading - float(then.roll_pitch_yaw[2])
         turn = rotation_z(angle)
         shift = np.array([x, y, then.position[2]]) - turn @ then.position
-        turned = (turn @ value for value in (then.rotation, then.velocity, then.angular_velocity))
-        self.pose_as(Measurement(turn @ then.position + shift, *turned, then.joints, then.joint_velocities))
+        rotation, velocity, angular = (turn @ v for v in (then.rotation, then.velocity, then.angular_velocity))
+        position = turn @ then.position + shift
+        self.pose_as(Measurement(position, rotation, velocity, angular, then.joints, then.joint_velocities))
         self.controller.reset(self.measured, snapshot.memory.moved(angle, shift))
 
     def steady_gait(self, interval: int = 5) -> list[Snapshot]:
