@@ -17,6 +17,7 @@ from torchrl_sspl.certification.conditions import (
 from torchrl_sspl.certification.layers import deterministic_layer
 from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.statistics import clopper_pearson, paper_layer, statistical_layer
+from torchrl_sspl.certification.vnnlib import export_vnnlib
 
 __all__ = [
     "Budget",
@@ -34,6 +35,7 @@ __all__ = [
     "decide_invariance",
     "decide_vacuity",
     "deterministic_layer",
+    "export_vnnlib",
     "find_counterexamples",
     "largest_error",
     "paper_layer",

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import math
 from decimal import ROUND_CEILING, ROUND_FLOOR, Context, Decimal
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from torchrl_sspl.certification.certificate import Statement
+from typing import Any
 
 #: Statements whose value is a bound from below; every other value bounds something from above.
 LOWER_BOUNDS = ("tolerated error", "float32", "float64")
@@ -33,7 +30,7 @@ def down(value: float, digits: int = 4) -> str:
     return _rounded(value, digits, ROUND_FLOOR)
 
 
-def shown(statement: Statement, digits: int = 4) -> str:
+def shown(statement: Any, digits: int = 4) -> str:
     """Value and unit of a statement, rounded to the side on which it is still true; "" without one, shares in per cent.
 
     Example:
@@ -46,7 +43,7 @@ def shown(statement: Statement, digits: int = 4) -> str:
     return _with_unit(statement.value, statement.unit, digits, statement.name in LOWER_BOUNDS)
 
 
-def missed(statement: Statement, digits: int = 3) -> str:
+def missed(statement: Any, digits: int = 3) -> str:
     """By how much a statement fails, at most, "" where unknown; what a search found may be exceeded elsewhere.
 
     Example:
