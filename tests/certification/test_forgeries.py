@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import math
 import subprocess
@@ -127,6 +128,29 @@ def test_the_honest_certificate_is_found_again(issued):
     assert code == Exit.HOLDS, text
     assert text.count("checked again:") == 3
     assert "claimed" not in text
+
+
+HONEST = [
+    {"episodes": episodes, "horizon": horizon, "confidence": confidence, "level": level, "seed": seed}
+    for (episodes, horizon), (confidence, level, seed) in itertools.product(
+        [(60, 1), (300, 7), (41, 30), (500, 3)],
+        [(0.95, None, None), (0.999, 0.0, 17), (0.5, -0.1, 2**31 + 5), (0.9, 0.05, 20260102), (0.99, -0.2, 0)],
+    )
+]
+
+
+@pytest.mark.parametrize("settings", [pytest.param(s, marks=pytest.mark.slow if k % 5 != k // 5 else ()) for k, s in enumerate(HONEST)])
+def test_honest_certificates_of_any_settings_are_found_again(settings, tmp_path, monkeypatch):
+    directory = tmp_path / "pendulum"  # also in a folder with the name of a shipped agent
+    agent = line_agent()
+    agent.save(directory)
+    certificate = certify(agent, Line(), name="line", acceptable=0.5, **settings)
+    certificate.save(directory / "certificate.json")
+    monkeypatch.chdir(tmp_path)
+    assert certificate.layers["deterministic"].verdict, "this is about certificates that hold"
+    code, text = verify(directory)
+    assert code == Exit.HOLDS, text
+    assert text.count("checked again:") == 3
 
 
 def test_without_the_system_nothing_measured_is_printed_as_checked(issued):
