@@ -78,9 +78,13 @@ class ActionValueLoss(LatentLoss):
 
     @dataclass
     class _AcceptedKeys(LatentLoss._AcceptedKeys):
-        """Keys that can be changed with ``set_keys``."""
+        """Keys that can be changed with ``set_keys``.
 
-        action_value: NestedKey = "action_value"  # (*batch, k^m) values of a regular grid of actions
+        Attributes:
+            action_value: values ``(*batch, k^m)`` of a regular grid of actions.
+        """
+
+        action_value: NestedKey = "action_value"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

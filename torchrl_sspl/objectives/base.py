@@ -155,16 +155,27 @@ class LatentLoss(LossModule):
 
     @dataclass
     class _AcceptedKeys:
-        """Keys that can be changed with ``set_keys``."""
+        """Keys that can be changed with ``set_keys``.
 
-        observation: NestedKey = "pixels"  # read by the encoder
-        frames: NestedKey = "frames"  # three in succession, read in place of two observations where present
-        latent: NestedKey = "latent"  # read where there is no encoder
-        action: NestedKey = "action"  # in physical units
-        region: NestedKey = "region"  # code: 0 unlabelled, 1 safe, 2 unsafe
-        user_action: NestedKey = "user_action"  # of the user's policy, in physical units
-        priority_weight: NestedKey = "priority_weight"  # of prioritised sampling
-        residual: NestedKey = "residual"  # error to add to predicted successors, read where present
+        Attributes:
+            observation: observation that the encoder reads.
+            frames: three successive frames, read in place of two observations where present.
+            latent: latent, read where there is no encoder.
+            action: action in physical units.
+            region: region code, 0 unlabelled, 1 safe, 2 unsafe.
+            user_action: action of the user's policy, in physical units.
+            priority_weight: weights of prioritised sampling.
+            residual: error of the dynamics to add to predicted successors, read where present.
+        """
+
+        observation: NestedKey = "pixels"
+        frames: NestedKey = "frames"
+        latent: NestedKey = "latent"
+        action: NestedKey = "action"
+        region: NestedKey = "region"
+        user_action: NestedKey = "user_action"
+        priority_weight: NestedKey = "priority_weight"
+        residual: NestedKey = "residual"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys

@@ -53,12 +53,19 @@ class TargetLoss(LatentLoss):
 
     @dataclass
     class _AcceptedKeys(LatentLoss._AcceptedKeys):
-        """Keys that can be changed with ``set_keys``."""
+        """Keys that can be changed with ``set_keys``.
 
-        barrier_target: NestedKey = "barrier_target"  # (*batch, 1) target of the barrier
-        inside: NestedKey = "inside"  # (*batch, 1) bool, whether the latent belongs to the set
-        action_target: NestedKey = "action_target"  # (*batch, action_dim) target of the policy, physical units
-        action_weight: NestedKey = "action_weight"  # (*batch, 1) weight of the policy's target (0: none)
+        Attributes:
+            barrier_target: target ``(*batch, 1)`` of the barrier.
+            inside: whether the latent belongs to the set, ``(*batch, 1)`` bool.
+            action_target: target ``(*batch, action_dim)`` of the policy, physical units.
+            action_weight: weight ``(*batch, 1)`` of the policy's target; 0: none.
+        """
+
+        barrier_target: NestedKey = "barrier_target"
+        inside: NestedKey = "inside"
+        action_target: NestedKey = "action_target"
+        action_weight: NestedKey = "action_weight"
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
