@@ -143,9 +143,11 @@ def test_domain_is_kept_or_a_point_leaves_it():
     assert float(leave.step(refuted.witness[None]).abs().max()) > 1.0
 
 
-@pytest.mark.parametrize(("limit", "status"), [(0.9, "proved"), (1.0, "proved"), (1.5, "refuted")])
-def test_a_clamp_proves_the_domain_only_if_it_lies_in_it(limit, status):
-    step = nn.Sequential(*plant(2.0 * torch.eye(2)), nn.Hardtanh(-limit, limit))
+@pytest.mark.parametrize(
+    ("low", "high", "status"), [(-0.9, 0.9, "proved"), (-1.0, 1.0, "proved"), (-1.5, 0.9, "refuted"), (-0.9, 1.5, "refuted")]
+)
+def test_a_clamp_proves_the_domain_only_if_it_lies_in_it(low, high, status):
+    step = nn.Sequential(*plant(2.0 * torch.eye(2)), nn.Hardtanh(low, high))
     system = closed_loop(one_norm(2), step, no_policy(2), latent_dim=2, lipschitz_bound=1.5)
     assert decide_domain(system).status == status
 

@@ -485,6 +485,7 @@ MALFORMED: dict[str, Callable[[Path, Body], Any]] = {
     "a list": raw("[]"),
     "null": raw("null"),
     "nested a hundred thousand times": raw("[" * 100_000),
+    "nested a few times too often": with_(lambda b: b["record"].update(system=json.loads("[" * 9 + "]" * 9))),
     "nested objects": raw('{"a":' * 50_000 + "1" + "}" * 50_000),
     "ten megabytes": raw("{" + " " * 10_000_000 + "}"),
     "an integer of ten thousand digits": text_edit('"level": 0.0', f'"level": {"9" * 10_000}'),
@@ -549,6 +550,7 @@ MALFORMED: dict[str, Callable[[Path, Body], Any]] = {
     "aliased without entering U": counts(aliased=2, events=2),
     "more mistaken than shown": counts(mistaken=251),
     "exceeding more than there are": counts(exceeding=400),
+    "more episodes than the last block has": with_(lambda b: b["record"]["blocks"][1].update(episodes=51, steps=204)),
     "one block too many": with_(lambda b: b["record"]["blocks"].append(b["record"]["blocks"][0])),
     "one block too few": with_(lambda b: b["record"]["blocks"].pop()),
     "no blocks": of_record(blocks=[]),
@@ -589,6 +591,12 @@ def test_a_malformed_file_is_no_certificate(name, issued, tmp_path):
     assert text.startswith(f"FAILED {Reason.SCHEMA_UNKNOWN.name}")
     assert len(text) < 1000
     assert text.isprintable()
+
+
+def test_nesting_is_refused_before_anything_is_parsed(issued, tmp_path):
+    directory = copied(issued, tmp_path)
+    (directory / "certificate.json").write_text("[" * 9 + "]" * 9)
+    assert "levels of nesting" in verify(directory)[1]
 
 
 def test_no_certificate_and_a_folder_in_its_place_are_told(issued, tmp_path):

@@ -16,6 +16,7 @@ from torchrl_sspl.certification.statistics import (
     clopper_pearson,
     fingerprint,
     largest_error_bound,
+    paper_numbers,
     quantile_rank,
     share_upper,
     statistical_layer,
@@ -96,6 +97,20 @@ def counts(**values: int) -> Counts:
 def record(**values: Any) -> Record:
     base: dict[str, Any] = {"kind": "resets", "system": "given", "seed": 7, "episodes": 100, "horizon": 10, "envs": 100}
     return Record(**(base | values))
+
+
+def test_blocks_of_resets_that_show_nothing_are_not_complete_before_all_episodes_are_drawn():
+    nothing = counts(episodes=0, steps=0, shown=0)
+    assert not record(episodes=300, blocks=[nothing]).complete()
+    assert record(episodes=300, blocks=[nothing] * 3).complete()
+
+
+def test_what_the_papers_proof_needs_counts_the_step_of_the_closed_loop_too():
+    one = torch.tensor([-0.25])
+    sizes, _ = paper_numbers(
+        safe=one, unsafe=-one, following=one, lipschitz_bound=1.0, covering_radius=0.1, dynamics_error=0.0, closed_loop_constant=2.0
+    )
+    assert (sizes["following_met"], sizes["following_met_as_needed"]) == (1, 0)  # asked for 0.1, needed 0.1 (2 + 1)
 
 
 def test_blocks_of_states_are_as_many_as_episodes_ask_for():

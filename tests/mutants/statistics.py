@@ -8,6 +8,7 @@ SEEDS, BLOCKS = "torchrl_sspl/seeds.py", "torchrl_sspl/evaluation/blocks.py"
 BOUNDS, TWINS = "tests/certification/test_statistics.py", "tests/certification/test_refusals.py"
 FORGED, LOOPS = "tests/certification/test_forgeries.py", "tests/evaluation/test_certify.py"
 MALFORMED = f"{FORGED}::test_a_malformed_file_is_no_certificate"
+NESTED = f"{FORGED}::test_nesting_is_refused_before_anything_is_parsed"
 CLAIMS = f"{FORGED}::test_a_forgery_with_a_fitting_digest_is_refused"
 STEPS = f"{LOOPS}::test_events_are_those_of_every_single_step"
 
@@ -40,7 +41,7 @@ MUTANTS = [
     (STATISTICS, "total.outside, total.seen, Reason", "0, total.seen, Reason", TWINS),
     (STATISTICS, "if not total.episodes or not total.shown", "if not total.episodes and not total.shown", TWINS),
     (STATISTICS, "if tolerated is None or tolerated <= 0", "if tolerated is None", BOUNDS),
-    (STATISTICS, "needed = psi * (closed_loop_constant + 1.0)", "needed = psi * closed_loop_constant", TWINS),
+    (STATISTICS, "needed = psi * (closed_loop_constant + 1.0)", "needed = psi * closed_loop_constant", BOUNDS),
     (STATISTICS, "psi3 = psi * (number[\"closed_loop_constant\"] + 1.0)", "psi3 = psi", TWINS),
     (STATISTICS, "\"unsafe\": -unsafe.double()", "\"unsafe\": unsafe.double()", TWINS),
     (STATISTICS, "\"following\", psi + eta, ", "\"following\", psi, ", TWINS),
@@ -66,7 +67,7 @@ MUTANTS = [
     (RECORD, "any(s[f\"{k}_met\"] > s[k] for", "any(False for", MALFORMED),
     # Reading a certificate.
     (CERTIFICATE, "is not int or body[\"schema\"] != SCHEMA", "is int and body[\"schema\"] != SCHEMA", MALFORMED),
-    (CERTIFICATE, "if depth > _DEPTH:", "if depth > 10**9:", MALFORMED),
+    (CERTIFICATE, "if depth > _DEPTH:", "if depth > 10**9:", NESTED),
     (CERTIFICATE, "if len(data) > _BYTES:", "if False:", MALFORMED),
     (CERTIFICATE, "if len(body) < len(pairs):", "if False:", MALFORMED),
     (CERTIFICATE, "parse_constant=_no_constant, ", "", MALFORMED),
