@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import torchrl_sspl as sspl
-from torchrl_sspl.certification.branch_and_bound import SLACK, Budget
+from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, maximise
 from torchrl_sspl.certification.conditions import (
     ClosedLoop,
     closed_loop,
@@ -132,6 +132,17 @@ def test_empty_and_full_sets_are_called_so():
     found = decide_vacuity(make(0.5))
     assert found.status == "neither"
     assert float(found.inside.abs().sum()) < 0.5 < float(found.outside.abs().sum())
+
+
+def test_a_set_in_a_corner_is_not_overlooked():
+    barrier = nn.Sequential(linear(torch.full((1, 2), 0.7071), torch.tensor([1.413])))  # below zero near (-1, -1) only
+    system = closed_loop(barrier, plant(-torch.eye(2)), no_policy(2), latent_dim=2, lipschitz_bound=1.0)
+    assert maximise(system.problem(level=0.0), threshold=0.0, budget=Budget(boxes=2000), seek=False).status != "proved"
+
+
+def test_a_decrease_that_fails_deep_in_the_set_is_not_proved_without_a_search():
+    problem = linear_system(2, 0.8).problem(level=0.0, weight=(1.2,), constant=(-0.05,))  # 0.05 - 0.4 |z|, above zero near 0
+    assert maximise(problem, threshold=0.0, budget=Budget(boxes=2000), seek=False).status != "proved"
 
 
 def test_domain_is_kept_or_a_point_leaves_it():

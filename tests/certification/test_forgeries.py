@@ -97,6 +97,14 @@ def to(name: str, layer: str = "deterministic", /, **values: Any) -> Callable[[B
     return change
 
 
+def nearly(name: str, layer: str, /) -> Callable[[Body], None]:
+    def change(body: Body) -> None:
+        found = statement(body, name, layer)
+        found["value"] *= 0.995
+
+    return change
+
+
 def regenerated(change: Callable[[Body], None]) -> Callable[[Body], None]:
     """Changes the record, and lets every measured statement follow from it, as a very careful forger would."""
 
@@ -187,6 +195,7 @@ FORGED: dict[str, tuple[Callable[[Body], Any], Reason]] = {
     "Lipschitz constant lowered": (to("Lipschitz constant", value=1.0), NUMBERS),
     "Lipschitz constant lowered in the text": (to("Lipschitz constant", text="B is 1-Lipschitz (exact arithmetic on the deployed weights)"), TEXT),
     "rounding lowered": (to("rounding", value=1e-18), NUMBERS),
+    "bound of the risk lowered by half a percent": (nearly("episodes", "statistical"), RECORD),
     "measured called proved": (to("invariance", kind="measured"), TEXT),
     "holds turned to fails": (to("invariance", holds=False, reason="NOT_INVARIANT", misses_by=0.1), NUMBERS),
     "statement added": (lambda b: b["layers"]["deterministic"]["statements"].append(

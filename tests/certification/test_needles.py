@@ -213,9 +213,9 @@ def test_points_within_the_slack_of_the_floor_count(lipschitz):
 def test_witnesses_lie_in_the_set_by_more_than_the_slack():
     problem = affine_loop(0.6).problem(level=-0.1)
     problem.floor = -0.4
-    near = torch.tensor([-0.5, -0.4, -0.4 + 2 * SLACK, -0.2, -0.1 - 2 * SLACK, -0.1 - 0.5 * SLACK, -0.1, 0.0]).double()
-    near[2], near[4], near[5] = -0.4 + 2 * SLACK, -0.1 - 2 * SLACK, -0.1 - 0.5 * SLACK
-    assert problem.feasible(near).tolist() == [False, False, True, True, True, False, False, False]
+    edges = [-0.5, -0.4, -0.4 + 0.5 * SLACK, -0.4 + 2 * SLACK, -0.2, -0.1 - 2 * SLACK, -0.1 - 0.5 * SLACK, -0.1, 0.0]
+    near = torch.tensor(edges, dtype=torch.float64)
+    assert problem.feasible(near).tolist() == [False, False, False, True, True, True, False, False, False]
 
 
 def test_an_open_search_bounds_from_above_what_it_has_not_decided():

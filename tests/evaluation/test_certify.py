@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -379,6 +380,16 @@ def test_the_system_of_a_description_is_one_of_the_library():
     for broken in ({}, {"config": 7}, {"config": {"env": []}}, {"environment": 3}, {"environment": "../x"}, {"environment": "NoEnv"},
                    {"config": {"env": {"_target_": "torchrl_sspl.envs.PendulumEnv", "colour": 1}}}):  # fmt: skip
         assert described_system(broken) is None
+
+
+def test_code_that_a_description_names_is_imported_only_if_it_is_trusted(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "somebodys_code.py").write_text("from torchrl_sspl.envs import PendulumEnv")
+    description = {"config": {"env": {"_target_": "somebodys_code:PendulumEnv"}}}
+    assert described_system(description) is None
+    assert "somebodys_code" not in sys.modules
+    assert described_system(description, trust=True) is not None
+    sys.modules.pop("somebodys_code", None)
 
 
 @pytest.mark.parametrize(

@@ -131,7 +131,7 @@ MUTANTS = [
     (CERTIFY, "abs(a[1] - b[1]) > close * claimed.horizon + max(3, b[1] // 100)", "False", CLAIMS),
     (CERTIFY, "value > found.sizes[name] + slack", "False", CLAIMS),
     (CERTIFY, "code = Exit.TIME if set(found) == {Reason.UNDECIDED} else Exit.REFUSED", "code = Exit.REFUSED", f"{LOOPS}::test_a_slow_machine_that_verifies_says_that_the_time_was_short"),
-    (BLOCKS, "kind = resolve(spec[\"_target_\"]) if found else None", "kind = resolve(spec[\"_target_\"])", f"{LOOPS}::test_the_system_of_a_description_is_one_of_the_library"),
+    (BLOCKS, "kind = resolve(spec[\"_target_\"]) if found else None", "kind = resolve(spec[\"_target_\"])", f"{LOOPS}::test_code_that_a_description_names_is_imported_only_if_it_is_trusted"),
     (BLOCKS, "if not (isinstance(kind, type) and issubclass(kind, SafetyEnv)):", "if False:", f"{LOOPS}::test_the_system_of_a_description_is_one_of_the_library"),
     (CERTIFY, "s.kind if checked or s.kind == ASSUMED else \"claimed\"", "s.kind", f"{FORGED}::test_without_the_system_nothing_measured_is_printed_as_checked"),
     (CERTIFY, "except CheckpointError as error:\n        raise _Stop(Exit.AGENT", "except CheckpointError as error:\n        raise _Stop(Exit.REFUSED", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),
