@@ -561,6 +561,7 @@ MALFORMED: dict[str, Callable[[Path, Body], Any]] = {
     "exceeding more than there are": counts(exceeding=400),
     "more episodes than the last block has": with_(lambda b: b["record"]["blocks"][1].update(episodes=51, steps=204)),
     "more steps than its episodes have": with_(lambda b: [one.update(steps=n) for one, n in zip(b["record"]["blocks"], (999, 201), strict=True)]),
+    "episodes longer than the horizon": with_(lambda b: b["record"]["sizes"].update(longest=5)),
     "one block too many": with_(lambda b: b["record"]["blocks"].append(b["record"]["blocks"][0])),
     "one block too few": with_(lambda b: b["record"]["blocks"].pop()),
     "no blocks": of_record(blocks=[]),

@@ -176,7 +176,7 @@ MUTANTS = [
     (FLOATING, "(middle.abs() + radius) @ made", "(middle + radius) @ made", f"{RATIONAL} {SMOOTH}"),
     (FLOATING, "own = own if act.ulps or act.jump else torch.zeros_like(before)", "own = torch.zeros_like(before)", SMOOTH,
      "float32 activations are far more accurate than the eight units that are allowed for; the sums around them hide their share"),
-    (FLOATING, "error = torch.stack([s.abs() for s in slopes[number]]).amax(0) * before + own", "error = own", ACTION),
+    (FLOATING, "error = torch.stack([s.abs() for s in slopes[number]]).amax(0) * before + own", "error = own", f"{ACTION} {RATIONAL} {SMOOTH}"),
     (FLOATING, "return float(bound.max()) * _SAFETY", "return float(bound.min()) * _SAFETY", DOMAIN),
     (FLOATING, "size = step.bias.abs()\n", "size = 0.0 * step.bias\n", ACTION),
     # What is deployed.
