@@ -77,6 +77,7 @@ def tensor_law(law: Callable[[float], float]) -> Callable[[Tensor], Tensor]:
 LOOPS: dict[str, tuple[Callable[[float], float], Callable[[float], float], float, tuple[str, ...]]] = {
     "kept": (same, same, 1.8, ()),
     "leaves the set": (jump(0.2, 0.6), same, 1.8, ("left", "exceeding")),
+    "leaves the set and comes back": (lambda x: 0.6 if 0.2 < abs(x) < 0.4 else 0.0 if abs(x) > 0.45 else x, same, 1.8, ("left", "exceeding")),
     "enters U and stays": (jump(0.2, 0.95), same, 1.8, ("left", "entered", "exceeding")),
     "enters U, which looks safe": (jump(0.2, 0.95), jump(0.8, 0.1), 1.8, ("entered", "aliased", "exceeding")),
     "starts in U that look safe": (same, jump(0.8, 0.1), 1.8, ("entered", "aliased")),
