@@ -1,6 +1,6 @@
 """[V] confirmed by a verifier that is not ours: Marabou, from the ONNX and VNN-LIB files that `export_vnnlib` writes.
 
-Run: pip install maraboupy, then python benchmarks/independent.py [agent=pendulum] [cells=8] [seconds=20] [share=1/1] [most=0]
+Run: pip install maraboupy onnxruntime, then python benchmarks/independent.py [agent=pendulum] [cells=8] [seconds=20] [share=1/1] [most=0]
 
 The latent domain is cut into `cells` boxes per axis; in each of them Marabou is asked for a latent with B(z) <= s that is led to
 B >= s. A box that it does not decide in `seconds` is cut into eight. A counterexample counts if the exported network, evaluated

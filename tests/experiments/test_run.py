@@ -6,11 +6,10 @@ import json
 from functools import partial
 from types import SimpleNamespace
 
-import gymnasium
 import numpy as np
 import pytest
 import torch
-from gymnasium import spaces
+from evaluation.systems import Lane, Where, lane
 from tensordict import TensorDict
 from tiny import TINY_PHASES
 from torch import nn
@@ -29,45 +28,6 @@ from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.stepper import SSPLStepper
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-
-
-class Lane(gymnasium.Env):
-    """A point at 0..15 moves by the action; beyond 12 the episode ends."""
-
-    render_mode = "rgb_array"
-    observation_space = spaces.Box(0, 20, (1,), np.float64)
-    action_space = spaces.Box(-3.0, 3.0, (1,), np.float32)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.x = float(self.np_random.integers(1, (options or {}).get("below", 9)))
-        return np.array([self.x]), {}
-
-    def step(self, action):
-        self.x = float(np.clip(self.x + float(action[0]), 0, 15))
-        return np.array([self.x]), 0.0, self.x > 12, False, {}
-
-    def render(self):
-        picture = np.zeros((16, 16, 3), np.uint8)
-        picture[:, round(self.x)] = 255
-        return picture
-
-
-def lane(batch_size=(4,), seed=0, make=Lane, **options) -> GymnasiumPixels:
-    sets = {"safe": lambda state, info: state[0] < 3, "unsafe": lambda state, info: state[0] > 10}
-    return GymnasiumPixels(make, batch_size=batch_size, seed=seed, image_size=16, **(sets | options))
-
-
-class Where(nn.Module):
-    """Latent (x, 0) / 16, read from the second frame."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.scale = nn.Parameter(torch.ones(1))
-
-    def forward(self, pixels: torch.Tensor) -> torch.Tensor:
-        x = pixels[..., 3, 0, :].float().argmax(-1, keepdim=True) / 16
-        return torch.cat([self.scale * x, torch.zeros_like(x)], -1)
 
 
 def test_exploration_is_random_in_its_share_of_the_environments():

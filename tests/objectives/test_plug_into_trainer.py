@@ -35,7 +35,7 @@ def test_a_loop_of_ones_own_separates_safe_from_unsafe(example) -> None:
     assert set(result) == set(example.SHOWN)
 
 
-@pytest.mark.slow  # at sizes that fit into a minute the phases find no set
+@pytest.mark.slow
 def test_the_stock_trainer_followed_by_the_phases_finds_a_set_that_is_kept(example) -> None:
     result = example.main(*SMALL, batches=19, updates=200)
     assert result["safe_called_unsafe"] <= 0.05
