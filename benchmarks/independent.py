@@ -54,7 +54,8 @@ def main(agent: str = "pendulum", *, cells: int = 8, seconds: int = 20, share: s
     corners = np.array(list(itertools.product(range(cells), repeat=loaded.latent_dim))) * size - 1.0
     order = np.random.default_rng(0).permutation(len(corners))[part - 1 :: parts_of][: most or None]
     table, start = {"boxes": len(order), "of": len(corners), "confirmed": 0, "refuted": 0, "undecided": 0, "questions": 0}, time.time()
-    for corner in tqdm(corners[order], unit="box"):
+    bar = tqdm(corners[order], unit="box")
+    for corner in bar:
         todo, verdict = [(corner, size, 0)], "confirmed"
         while todo and verdict == "confirmed":
             low, width, depth = todo.pop()
@@ -71,7 +72,7 @@ def main(agent: str = "pendulum", *, cells: int = 8, seconds: int = 20, share: s
                 halves = itertools.product((0.0, width / 2), repeat=len(low))
                 todo += [(low + np.array(offset), width / 2, depth + 1) for offset in halves]
         table[verdict] += 1
-        print(table, file=sys.stderr)
+        bar.set_postfix(table)
     return table | {"seconds": round(time.time() - start)}
 
 
