@@ -162,5 +162,5 @@ def test_a_phase_takes_the_place_of_another(use):
     assert calm["step"] == 20
     assert calm["loss_calm"] > 0
     order = list(dict.fromkeys(row["phase"] for row in rows if row["round"] == 1))
-    assert order[-3:] == ["tune", "calm", "check"]
+    assert order[-3:] == ["tighten", "calm", "check"]
     assert not any(p.requires_grad for p in agent.parameters())

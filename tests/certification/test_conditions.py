@@ -163,6 +163,17 @@ def test_a_clamp_proves_the_domain_only_if_it_lies_in_it(low, high, status):
     assert decide_domain(system).status == status
 
 
+def test_a_domain_that_is_left_by_less_than_the_slack_is_neither_kept_nor_left():
+    beyond = 3 * 2.0**-23  # a number of float32, and less than the slack
+    assert 0.0 < beyond < SLACK
+    step = plant((1 + beyond) * torch.eye(1))
+    found = decide_domain(closed_loop(one_norm(1), step, no_policy(1), latent_dim=1, lipschitz_bound=1.0))
+    assert found.status == "undecided"
+    assert found.lower == pytest.approx(beyond, rel=1e-6)
+    assert beyond <= found.upper <= SLACK
+    assert found.boxes < 5000  # nothing is left that further bisection could decide
+
+
 def test_budget_of_no_boxes_leaves_it_undecided():
     found = decide_invariance(linear_system(3, 0.99), budget=Budget(boxes=0))
     assert found.status == "undecided"

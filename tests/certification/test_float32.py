@@ -52,6 +52,17 @@ def test_float32_activations_are_as_accurate_as_is_assumed(module):
     assert bool((off <= allowed).all()), float((off - allowed).max())
 
 
+@pytest.mark.parametrize("module", [m for m in ACTIVATIONS if not isinstance(m, nn.Hardtanh | nn.LeakyReLU)], ids=str)
+def test_float64_activations_are_as_accurate_as_is_assumed(module):
+    # Where PyTorch goes over to another formula, float64 shows what float32 hides in its rounding.
+    x = torch.linspace(-30, 30, 200_001, dtype=torch.float64)
+    act = activation_of(module)
+    exact = act.value(x)
+    off = (module(x) - exact).abs()
+    allowed = act.ulps * UNITS[torch.float64] * (x.abs() + exact.abs()) + act.jump
+    assert bool((off <= allowed).all()), float((off - allowed).max())
+
+
 @pytest.mark.parametrize("module", ACTIVATIONS, ids=str)
 def test_slopes_of_intervals_hold_every_secant(module):
     act, g = activation_of(module), torch.Generator().manual_seed(0)
@@ -172,6 +183,16 @@ def test_bounds_hold_for_networks_of_every_activation(module):
     assert float(bound.max()) < 1e-3
 
 
+@pytest.mark.parametrize("module", ACTIVATIONS, ids=str)
+def test_bounds_hold_for_an_activation_alone(module):
+    # Between two layers, what the sums are allowed to lose hides what it loses itself.
+    graph, x = Graph(1), torch.linspace(-25, 25, 20_001)[:, None]
+    graph.apply(0, activation_of(module))
+    gap = (module(x).double() - graph(x)).abs()
+    for refined in (False, True):
+        assert bool((gap <= rounding_bound(graph, x.double(), x.double(), U, refined=refined)[-1]).all())
+
+
 def test_units_are_those_of_the_dtypes():
     assert {dtype: torch.finfo(dtype).eps / 2 for dtype in (torch.float32, torch.float64)} == UNITS
 
@@ -202,16 +223,21 @@ def test_products_and_sums_each_round_once():
     assert rounding_bound(graph, x.double(), x.double(), 2.0**-53)[-1].item() < 1e-15
 
 
-def test_errors_of_the_action_reach_the_next_latent():
-    # The policy is u = K (z + 2) - K (z + 1) - K + z: nothing but rounding beside z, and the plant takes it as it is.
+@pytest.mark.parametrize("clamped", [False, True])
+def test_errors_of_the_action_reach_the_next_latent(clamped):
+    # The policy is u = K (z + 2) - K (z + 1) - K + z / 10: nothing but rounding beside z, and the plant takes it as it is.
+    # Clamped, the action is a small number again, which rounds off little itself.
     k = 2.0**20
     policy = nn.Sequential(linear([[k], [k], [1.0], [-1.0]], [2 * k, k, 0.0, 0.0]), nn.ReLU(), linear([[1.0, -1.0, 0.1, -0.1]], [-k]))
+    if clamped:
+        policy.append(nn.Hardtanh())
     plant = nn.Sequential(linear([[0.5, 0.5]]))
     system = closed_loop(one_norm(0.5), plant, policy, latent_dim=1, lipschitz_bound=1.001)
     z = (2 * torch.rand(20_000, 1, generator=torch.Generator().manual_seed(0)) - 1)
     gap = (plant(torch.cat([z, policy(z)], 1)).double() - system.step(z)).abs()
-    bound = rounding_bound(system.step, z.double(), z.double(), U, refined=True)[-1]
-    assert bool((gap <= bound).all())
+    for refined in (False, True):
+        bound = rounding_bound(system.step, z.double(), z.double(), U, refined=refined)[-1]
+        assert bool((gap <= bound).all())
     assert float(gap.max()) > 0.02
     assert float(bound.max()) < 20 * float(gap.max())
 
@@ -226,6 +252,17 @@ def test_terms_that_are_zero_do_not_round_and_roundings_besides_do():
     assert few == pytest.approx(2 * U, rel=1e-4)
     assert many == pytest.approx(7 * U, rel=1e-4)
     assert isinstance(more.steps[1], Affine)
+
+
+def test_a_bias_rounds_as_every_other_term():
+    net = linear([[1.0]], [1.0])
+    graph = Graph(1)
+    graph.network(0, net)
+    x = torch.full((1, 1), 0.9 * U)  # less than half a unit in the last place of the bias: lost
+    lost = abs(float(net(x).double() - graph(x)))
+    assert lost > 0.8 * U
+    for refined in (False, True):
+        assert lost <= float(rounding_bound(graph, x.double(), x.double(), U, refined=refined)[-1]) < 3 * U
 
 
 def test_a_sum_that_may_overflow_has_no_bound():
@@ -295,12 +332,15 @@ def test_what_is_left_of_the_tolerated_error_is_what_rounding_leaves():
     assert abs(double.delta - known.delta) < 1e-3
 
 
+def rough(k: float) -> nn.Sequential:
+    """B = |z| - 1/2 in real arithmetic; three large units cancel, and float32 leaves what they round off."""
+    first = linear([[1.0], [-1.0], [k], [k], [0.0]], [0.0, 0.0, 2 * k, k, k])
+    return nn.Sequential(first, nn.ReLU(), linear([[1.0, 1.0, 1.0, -1.0, -1.0]], [-0.5]))
+
+
 def test_a_point_that_only_the_computed_barrier_takes_in_counts():
     # In real arithmetic the set ends at 0.5; beyond 0.5001 the plant throws out. The computed barrier is off by more.
-    k = 1e4
-    barrier = nn.Sequential(
-        linear([[1.0], [-1.0], [k], [k], [0.0]], [0.0, 0.0, 2 * k, k, k]), nn.ReLU(), linear([[1.0, 1.0, 1.0, -1.0, -1.0]], [-0.5])
-    )
+    barrier = rough(1e4)
     throw = nn.Sequential(linear([[1.0, 0.0], [-1.0, 0.0], [1.0, 0.0]], [0.0, 0.0, -0.5001]), nn.ReLU(), linear([[0.5, -0.5, 9e3]]))
     idle = nn.Sequential(linear([[0.0]]))
     # The weights of the barrier prove no small constant; for this test it is 1 in real arithmetic.
@@ -310,6 +350,17 @@ def test_a_point_that_only_the_computed_barrier_takes_in_counts():
     real = computed_error(system, known, unit=U, budget=Budget(boxes=5000))
     assert 1e-4 < real.barrier_rounding + real.step_rounding < 0.2
     assert real.delta < 0.0
+
+
+def test_rounding_of_the_barrier_counts_where_a_step_begins_and_where_it_ends():
+    # z+ = z / 2: from |z| <= 1/2 + e, which may look inside, to |z+| <= 1/2 - e, which looks inside for certain.
+    halved, idle = nn.Sequential(linear([[0.5, 0.0]])), nn.Sequential(linear([[0.0]]))
+    system = closed_loop(rough(2e4), halved, idle, latent_dim=1, lipschitz_bound=1.0)
+    real = computed_error(system, largest_error(system, tolerance=1e-5), unit=U, tolerance=1e-5)
+    e = real.barrier_rounding
+    assert 0.005 < e < 0.1
+    assert real.step_rounding < 1e-6
+    assert 0.25 - 1.5 * e - 1e-4 < real.delta <= 0.25 - 1.5 * e
 
 
 def test_shipped_pendulum_keeps_its_set_in_float32():

@@ -87,6 +87,18 @@ def test_a_needle_that_leads_out_is_never_proved_away(place, width):
     assert decide(harmless, level=0.0).status == "proved"  # the bounds are good enough to see that it does no harm
 
 
+@pytest.mark.parametrize("place", PLACES)
+@pytest.mark.parametrize("beyond", [1e-4, 5e-3])
+def test_a_needle_that_leads_out_by_little_is_never_proved_away(place, beyond):
+    # By less than the bounds of the boxes around it are off: these boxes are cut down to where the needle is, and no further.
+    p, at = PLACES[place]
+    first, rest = at[0], sum(map(abs, at[1:]))
+    for excess, status in ((beyond, "undecided"), (-beyond, "proved")):
+        system = with_needle(p, at, 1e-3, 0.5 + excess - 0.5 * (first + rest))
+        assert float(system.looped(torch.tensor([at], dtype=torch.float64))) == pytest.approx(excess, abs=1e-6)
+        assert decide(system, level=0.0).status == status
+
+
 @pytest.mark.parametrize(("p", "corner"), [(1, [1.0]), (2, [1.0, -1.0]), (2, [-1.0, -1.0]), (3, [1.0, 1.0, 1.0])])
 def test_a_needle_in_a_corner_of_the_domain_is_seen(p, corner):
     # The set is everything but {B > s}: the barrier is high only beyond a radius that the corner has.
@@ -157,6 +169,23 @@ def test_needles_are_seen_by_the_conditions_that_ask_for_decrease(weight):
     for height, status in ((0.02, "proved"), (0.5, "undecided")):
         system = with_needle(2, [0.2, 0.2], 1e-4, height)
         assert decide(system, level=0.0, weight=weight, constant=constant).status == status
+
+
+@pytest.mark.parametrize("lipschitz", [1.0, math.inf])
+def test_a_decrease_that_fails_at_one_point_is_not_proved(lipschitz):
+    # B(z) - B(z+) = 0.9 |z| is small only next to zero, where B falls steeply from all sides.
+    system = affine_loop(0.1, lipschitz=lipschitz)
+    for asked, status in ((1e-4, "undecided"), (2 * SLACK, "undecided"), (-2 * SLACK, "proved")):
+        assert decide(system, level=0.0, weight=(1.0,), constant=(asked,)).status == status
+
+
+@pytest.mark.parametrize("below", [1e-2, 1e-3, 1e-5])
+def test_a_barrier_that_rises_along_the_diagonal_is_bounded_along_it(below):
+    # B(z+) = 0.6 |z|_1 - 1/2 is 0.7 in the corner of the domain, and reaches its Lipschitz constant on the way there.
+    plant = nn.Sequential(linear([[0.6, 0.0, 0.0], [0.0, 0.6, 0.0]]))
+    system = closed_loop(one_norm(2), plant, idle(2), latent_dim=2, lipschitz_bound=math.sqrt(2))
+    assert decide(system, level=None, constant=(below - 0.7,)).status == "undecided"
+    assert decide(system, level=None, constant=(-below - 0.7,)).status == "proved"
 
 
 def test_needles_are_seen_above_a_floor():

@@ -202,6 +202,26 @@ def test_linear_programme_on_boxes_is_never_below_what_sampling_finds():
     assert float((high - low).prod(1).sum()) < float((2 * radius).prod(1).sum())
 
 
+def test_boxes_that_are_cut_twice_keep_every_point_that_meets_both_constraints():
+    # As the search cuts them: both functions are written around the centre of the box that there was before, or elsewhere.
+    g = torch.Generator().manual_seed(8)
+    n, p = 400, 3
+    randn = lambda *shape: torch.randn(*shape, generator=g, dtype=torch.float64)  # noqa: E731
+    center, radius = randn(n, p), 0.1 + torch.rand(n, p, generator=g, dtype=torch.float64)
+    z = center + (2 * torch.rand(2000, n, p, generator=g, dtype=torch.float64) - 1) * radius
+    low, high = center - radius, center + radius
+    holds, written = torch.ones(2000, n, dtype=torch.bool), center
+    for away in (0.0, 1.0):
+        slope, value = randn(n, p), 0.3 * randn(n)
+        holds &= torch.einsum("np,snp->sn", slope, z - center) + value <= 0
+        written = center + away * randn(n, p)
+        moved = value + (slope * (written - center)).sum(1)
+        low, high = clip(low, high, LinearBound(slope[:, None], moved[:, None], written))
+    inside = ((z >= low - 1e-12) & (z <= high + 1e-12)).all(-1)
+    assert bool(inside[holds].all())
+    assert float((high - low).clamp_min(0.0).prod(1).sum()) < 0.8 * float((2 * radius).prod(1).sum())
+
+
 def test_search_closes_in_on_the_maximum_of_a_random_network():
     g = torch.Generator().manual_seed(7)
     graph = random_graph(nn.ReLU(), g, 2)

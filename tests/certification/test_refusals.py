@@ -21,7 +21,7 @@ from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, Statement, differences
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
 from torchrl_sspl.certification.record import Counts, Record
-from torchrl_sspl.certification.statistics import paper_layer, paper_numbers, statistical_layer
+from torchrl_sspl.certification.statistics import paper_layer, paper_numbers, run_time_layer, statistical_layer
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation import blocks
@@ -174,7 +174,7 @@ def test_level_is_lowered_where_zero_fails():
 
 def record(sizes: dict[str, int] | None = None, numbers: dict[str, float] | None = None, **changes: Any) -> Record:
     """3,000 episodes of 200 steps with nothing in them, in one block, and what is changed of that."""
-    block = dict(zip((f.name for f in fields(Counts)), (3000, 600_000, 0, 0, 0, 0, 0, 0, 3000, 0, 9000, 0), strict=True))
+    block = dict(zip((f.name for f in fields(Counts)), (3000, 600_000, 0, 0, 0, 0, 0, 0, 0, 3000, 0, 9000, 0), strict=True))
     known = {f.name for f in fields(Record)}
     settings = {k: v for k, v in changes.items() if k in known}
     block["episodes"] = changes.pop("n", 3000)
@@ -185,12 +185,12 @@ def record(sizes: dict[str, int] | None = None, numbers: dict[str, float] | None
 
 
 def test_valid_record_holds_and_states_its_confidence():
-    layer = statistical_layer(record(), tolerated_error=0.1)
+    layer = statistical_layer(record())
     assert layer.holds, layer.verdict
     assert layer["episodes"].value == pytest.approx(1 - 0.025 ** (1 / 3000), rel=1e-6)
     assert layer["episodes"].confidence == layer["unsafe observations"].confidence == 0.975
     assert layer["together"].confidence == 0.95
-    assert "0 of 3000" in layer["errors tolerated"].text
+    assert run_time_layer(record(), 0.1).holds
 
 
 STATISTICAL: dict[str, tuple[Record, Reason]] = {
@@ -216,18 +216,19 @@ STATISTICAL: dict[str, tuple[Record, Reason]] = {
 @pytest.mark.parametrize("name", STATISTICAL)
 def test_statistical_layer_refuses(name):
     twin, reason = STATISTICAL[name]
-    layer = statistical_layer(twin, tolerated_error=0.1)
+    layer = statistical_layer(twin)
     assert not layer.holds
     assert layer.reasons[0] is reason, layer.reasons
 
 
-def test_errors_beyond_the_tolerated_are_said_in_words():
-    layer = statistical_layer(record(exceeding=3000), tolerated_error=0.1)
-    remark = layer["errors tolerated"]
-    assert "3000 of 3000" in remark.text
-    assert "Theorem A does not apply" in remark.text
-    assert (remark.kind, remark.value) == ("reported", 1.0)
-    assert layer.holds  # what is measured directly does not rest on it
+@pytest.mark.parametrize("exceeding", [60, 3000])
+def test_run_time_layer_refuses_where_the_premise_often_fails(exceeding):
+    found = record(exceeding=exceeding, uncovered=exceeding)
+    layer = run_time_layer(found, 0.1)
+    assert layer.reasons == [Reason.PREMISE_NOT_MET]
+    assert f"{exceeding} of 3000" in layer["covered"].text
+    assert f"{600_000 - exceeding} of 600000" in layer["steps covered"].text
+    assert statistical_layer(found).holds  # what is measured directly does not rest on it
 
 
 # --- paper ------------------------------------------------------------------------------------------------------------
@@ -379,6 +380,7 @@ def test_every_reason_has_a_twin():
     files |= {Reason.DIGEST_CHANGED, Reason.SCHEMA_UNKNOWN}  # with tests of their own
     text = (Path(__file__).parent / "test_deployed.py").read_text() + (Path(__file__).parent / "test_float32.py").read_text()
     deployed = {r for r in Reason if f'"{r.name}"' in text or f"Reason.{r.name}" in text}
+    deployed |= {Reason.PREMISE_NOT_MET, Reason.NOTHING_TOLERATED}  # of the run-time layer, with tests of their own
     assert set(Reason) == here | paper | files | deployed | {Reason.VACUITY_UNDECIDED}
 
 

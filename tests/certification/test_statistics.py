@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import torch
 
-from torchrl_sspl.certification.certificate import Statement
+from torchrl_sspl.certification.certificate import Reason, Statement
 from torchrl_sspl.certification.record import NOTHING, Counts, Record
 from torchrl_sspl.certification.statistics import (
     clopper_pearson,
@@ -18,6 +18,7 @@ from torchrl_sspl.certification.statistics import (
     largest_error_bound,
     paper_numbers,
     quantile_rank,
+    run_time_layer,
     share_upper,
     statistical_layer,
 )
@@ -126,6 +127,22 @@ def test_blocks_of_states_are_as_many_as_episodes_ask_for():
 
 
 @pytest.mark.parametrize(
+    ("kind", "asked", "enough", "more"),
+    [("resets", 100, [100], [100, 100]), ("states", 300, [0], [0, 50]), ("states", 100, [100], [100, 0])],
+)
+def test_blocks_beyond_those_that_the_rule_asks_for_are_refused(kind, asked, enough, more):
+    # Who may draw on until the counts please him can claim any risk.
+    def check(episodes: list[int]) -> None:
+        blocks = [counts(episodes=n, steps=10 * n, shown=n) for n in episodes]
+        lengths = dict.fromkeys(("shortest", "median", "longest"), 10 if sum(episodes) else 0)
+        record(kind=kind, episodes=asked, blocks=blocks, sizes=lengths).check()
+
+    check(enough)
+    with pytest.raises(CertificationError, match="as many blocks"):
+        check(more)
+
+
+@pytest.mark.parametrize(
     ("blocks", "complete"),
     [
         ([(100, 100)], True),
@@ -207,8 +224,8 @@ def test_descriptions_carry_no_verdict():
         blocks=[counts(episodes=400, steps=4000, shown=400, seen=9)],
         rims=[("at the rim", 50, 0.3)], numbers={"episode_error": 0.2}, acceptable=0.2,
     )  # fmt: skip
-    layer = statistical_layer(measured, tolerated_error=0.1)
-    for name in ("errors tolerated", "largest error", "error at the rim"):
+    layer = statistical_layer(measured)
+    for name in ("largest error", "error at the rim"):
         statement: Statement = layer[name]
         assert (statement.kind, statement.holds, statement.reason) == ("reported", None, "")
     assert layer["error at the rim"].confidence is None
@@ -216,9 +233,11 @@ def test_descriptions_carry_no_verdict():
 
 
 @pytest.mark.parametrize("tolerated", [None, 0.0, -1.0])
-def test_where_no_error_is_tolerated_the_proof_says_nothing_about_episodes(tolerated):
-    layer = statistical_layer(record(blocks=[counts(episodes=9, shown=9)]), tolerated_error=tolerated)
-    assert "says nothing about episodes" in layer["errors tolerated"].text
+def test_where_no_error_is_tolerated_the_proof_applies_to_no_episode(tolerated):
+    layer = run_time_layer(record(blocks=[counts(episodes=9, shown=9)]), tolerated)
+    assert not layer.holds
+    assert layer.reasons == [Reason.NOTHING_TOLERATED]
+    assert [s.name for s in layer.statements] == ["covered"]
 
 
 def test_not_finite_numbers_are_none():

@@ -16,6 +16,7 @@ from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.objectives import (
     ActionValueLoss,
     ConsistencyLoss,
+    CounterexampleLoss,
     LipschitzLoss,
     PolicyDeviationLoss,
     SaLaDLoss,
@@ -239,5 +240,13 @@ CASES = [
         {"loss_consistency": {"dynamics"}},
         "dynamics",
         {"unsafe_weight": 0.3, "worst_fraction": 0.25},
+    ),
+    Case(
+        "counterexample",
+        CounterexampleLoss,
+        "latent",
+        {"loss_counterexample": {"barrier", "actor_network"}},
+        "dynamics barrier policy",
+        {"depth": 2.0, "worst_fraction": 0.25, "dynamics_margin": 1.0},
     ),
 ]

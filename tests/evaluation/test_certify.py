@@ -42,7 +42,7 @@ def total(certificate: Certificate) -> Counts:
 
 def by_hand(start: list[float], law: Callable[[float], float], shown: Callable[[float], float], gain: float) -> Counts:
     """Counts of episodes from given starts, one step after the other, in plain numbers."""
-    found = dict.fromkeys(("left", "entered", "aliased", "events", "exceeding"), 0)
+    found = dict.fromkeys(("left", "entered", "aliased", "events", "exceeding", "uncovered"), 0)
     for x in start:
         left = entered = aliased = exceeding = False
         for t in range(STEPS + 1):
@@ -55,7 +55,9 @@ def by_hand(start: list[float], law: Callable[[float], float], shown: Callable[[
             push = min(max(-2 * z, -1), 1)
             predicted = min(max(1.8 * z + 0.6 * push, -1), 1)
             x = law(min(max(gain * x + 0.6 * push, -1), 1))
-            exceeding |= abs(shown(x) - predicted) > 0.1326905
+            missed = abs(shown(x) - predicted) > 0.1326905 or abs(shown(x)) - 0.5 > 0
+            exceeding |= missed
+            found["uncovered"] += int(missed)
         for name, value in (("left", left), ("entered", entered), ("aliased", aliased), ("exceeding", exceeding)):
             found[name] += int(value)
         found["events"] += int(left or entered or aliased)
@@ -100,9 +102,11 @@ def test_events_are_those_of_every_single_step(name, monkeypatch):
     env = Line(tensor_law(law), tensor_law(shown), gain=gain)
     certificate = certify(line_agent(), env, episodes=300, horizon=STEPS)
     found, hand = total(certificate), by_hand(torch.cat(starts)[:, 0].tolist(), law, shown, gain)
-    for field in ("episodes", "steps", "left", "entered", "aliased", "events", "exceeding"):
+    for field in ("episodes", "steps", "left", "entered", "aliased", "events", "exceeding", "uncovered"):
         # The picture has 16 bits: who starts within one of them of a border may fall on either side.
-        assert abs(getattr(found, field) - getattr(hand, field)) <= 1, (field, found, hand)
+        most = STEPS if field == "uncovered" else 1
+        assert abs(getattr(found, field) - getattr(hand, field)) <= most, (field, found, hand)
+    assert certificate.layers["run-time"].holds == ("exceeding" not in expected)
     assert {k for k in ("left", "entered", "aliased", "exceeding") if getattr(found, k)} == set(expected)
     assert (found.mistaken > 0) == (shown is not same)
     if "left" in expected or "entered" in expected:
@@ -122,13 +126,12 @@ def test_a_system_in_which_every_episode_enters_u_and_stays_is_refused():
 
 
 def test_half_of_the_observations_of_u_are_where_it_is_entered():
-    # Only what one step can reach looks safe: |x| <= 1.8 * 0.8 is all of U here, so a thin rim is told by the step before.
-    agent, env = line_agent(), Line(gain=1.0, shown=lambda x: torch.where((x.abs() > 0.8) & (x.abs() <= 0.805), 0.1, x))
-    certificate = certify(agent, env, episodes=500, horizon=1)
-    found = total(certificate)
-    uniform = 250 * 0.005 / 0.2  # expected among the first half
+    # x+ = clamp(x + 0.6 v): 4 in 9 of those that enter U come to its very end, of a uniform sample 1 in 200.
+    # Only there it looks safe.
+    agent, env = line_agent(), Line(gain=1.0, shown=lambda x: torch.where(x.abs() > 0.999, 0.1, x))
+    found = total(certify(agent, env, episodes=500, horizon=1))
     assert found.shown == 500
-    assert found.mistaken > 1.2 * uniform / 2  # the other half adds those that enter it
+    assert 80 < found.mistaken < 150  # 111 of the 250 that enter it, and about one of the others
 
 
 class Blind(nn.Module):
@@ -143,16 +146,16 @@ class Blind(nn.Module):
         return torch.where(z[..., :1] > self.above, torch.nan, z)
 
 
-@pytest.mark.parametrize("known", [True, False])
-def test_no_number_is_an_event_and_no_way_to_stay_inside(known):
+@pytest.mark.parametrize(("known", "horizon"), [(True, 3), (True, 1), (False, 3)])  # after one step no policy is asked
+def test_no_number_is_an_event_and_no_way_to_stay_inside(known, horizon):
     agent = line_agent()
     blind = Agent(Blind(agent.encoder, 0.55), agent.dynamics, agent.barrier, agent.policy, 1.5, agent.description)
     law = partial(torch.where, torch.tensor(True), torch.tensor(0.7))  # every step leads to 0.7
     if known:
-        certificate = certify(blind, Line(law=lambda x: law(x) + 0 * x), episodes=50, horizon=3)
+        certificate = certify(blind, Line(law=lambda x: law(x) + 0 * x), episodes=50, horizon=horizon)
     else:
         make = partial(Line, lambda x: law(x) + 0 * x, initial=0.4)
-        certificate = certify_on_episodes(blind, make, episodes=50, horizon=3, envs=10)
+        certificate = certify_on_episodes(blind, make, episodes=50, horizon=horizon, envs=10)
     found = total(certificate)
     assert found.undefined == found.events == found.episodes >= 50
     layer = certificate.layers["statistical"]

@@ -15,6 +15,7 @@ from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import AgentController, Camera, Decision, RandomController, as_controller
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.modules.agent import load
+from torchrl_sspl.modules.observer import corrected
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
@@ -38,7 +39,7 @@ def plain_loop(agent, env, start, horizon):
         if not gone.all():
             now[~gone] = frames(env.draw(state[~gone]))
             latent = latent.clone()
-            latent[~gone] = head(before[~gone], now[~gone])
+            latent[~gone] = corrected(promised[~gone], head(before[~gone], now[~gone]), agent.gain)[0]
         value = agent.barrier(latent)[:, 0]
         found = (state, action, value, (promised - latent).norm(dim=-1), value - agent.barrier(promised)[:, 0])
         fill = (None, None, -1.0, 0.0, 0.0)

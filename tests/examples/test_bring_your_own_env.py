@@ -74,7 +74,7 @@ def test_from_the_simulator_to_the_report(name, example, tmp_path, monkeypatch):
     for name in ("starts_inside", "policy_touch_unsafe", "random_touch_unsafe"):
         assert again[name] == outcome.evaluation[name]
     assert verify_run(tmp_path, env=module.my_env) == 0
-    assert set(outcome.certificate.layers) == {"deterministic", "statistical", "paper"}
+    assert set(outcome.certificate.layers) == {"deterministic", "statistical", "run-time", "paper"}
     if encoder is not None:
         assert agent.description["networks"]["encoder"]["class"] == "bring_your_own_env:Encoder"
         monkeypatch.delitem(sys.modules, "bring_your_own_env")

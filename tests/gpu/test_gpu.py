@@ -171,7 +171,7 @@ def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(tmp_path):
             torch.testing.assert_close(value, found[key], msg=key)
 
 
-ROUND = ["gather", "dynamics", "fit", "steer", "tune", "check"]
+ROUND = ["gather", "dynamics", "fit", "steer", "tune", "tighten", "check"]
 AS_PRINTED = ["loss.preset=paper", "loss.reduction=mean", "network.barrier=lmi", "trainer.margins=true"]
 
 

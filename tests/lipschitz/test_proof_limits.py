@@ -169,13 +169,14 @@ def test_softplus_with_a_low_threshold_jumps():
     assert slope_interval(high) == (0.0, 1.0)
 
 
-def test_slope_that_the_activation_exceeds_is_refused():
+@pytest.mark.parametrize("slope", [(0.0, 1.0), (0.0, 1.1), (-0.1, 1.0), (-0.2, 1.09)])
+def test_slope_that_the_activation_exceeds_is_refused(slope):
     network = nn.Sequential(nn.Linear(1, 1), nn.SiLU(), nn.Linear(1, 1))
     with torch.no_grad():
         network[0].weight.fill_(1.0)
         network[2].weight.fill_(1.0)
     with pytest.raises(ConfigError, match=r"\(-0.1, 1.1\)"):
-        prove_lipschitz(network, 1.01, (0.0, 1.0))
+        prove_lipschitz(network, 1.01, slope)
     assert not prove_lipschitz(network, 1.01).proved  # its slope reaches 1.0998
     assert prove_lipschitz(network, 1.1001).proved
 

@@ -7,12 +7,13 @@ CERTIFICATE, CERTIFY = "torchrl_sspl/certification/certificate.py", "torchrl_ssp
 SEEDS, BLOCKS = "torchrl_sspl/seeds.py", "torchrl_sspl/evaluation/blocks.py"
 BOUNDS, TWINS = "tests/certification/test_statistics.py", "tests/certification/test_refusals.py"
 FORGED, LOOPS = "tests/certification/test_forgeries.py", "tests/evaluation/test_certify.py"
-MALFORMED = f"{FORGED}::test_a_malformed_file_is_no_certificate"
-NESTED = f"{FORGED}::test_nesting_is_refused_before_anything_is_parsed"
+_FILES = "tests/certification/test_malformed.py"
+MALFORMED = f"{_FILES}::test_a_malformed_file_is_no_certificate"
+NESTED = f"{_FILES}::test_nesting_is_refused_before_anything_is_parsed"
 CLAIMS = f"{FORGED}::test_a_forgery_with_a_fitting_digest_is_refused"
 STEPS = f"{LOOPS}::test_events_are_those_of_every_single_step"
 
-#: (file, old text, new text, tests)
+#: (file, old text, new text, tests[, why it survives])
 MUTANTS = [
     # Seeds.
     (SEEDS, "PURPOSES[purpose] * _INDICES + index", "PURPOSES[purpose] + index", "tests/test_seeds.py"),
@@ -40,7 +41,7 @@ MUTANTS = [
     (STATISTICS, "total.undefined, total.episodes,\n         Reason", "0, total.episodes,\n         Reason", TWINS),
     (STATISTICS, "total.outside, total.seen, Reason", "0, total.seen, Reason", TWINS),
     (STATISTICS, "if not total.episodes or not total.shown", "if not total.episodes and not total.shown", TWINS),
-    (STATISTICS, "if tolerated is None or tolerated <= 0", "if tolerated is None", BOUNDS),
+    (STATISTICS, "if tolerated_error is None or not tolerated_error > 0", "if tolerated_error is None", BOUNDS),
     (STATISTICS, "needed = psi * (closed_loop_constant + 1.0)", "needed = psi * closed_loop_constant", BOUNDS),
     (STATISTICS, "psi3 = psi * (number[\"closed_loop_constant\"] + 1.0)", "psi3 = psi", TWINS),
     (STATISTICS, "\"unsafe\": -unsafe.double()", "\"unsafe\": unsafe.double()", TWINS),
@@ -57,7 +58,7 @@ MUTANTS = [
     (RECORD, "if block.episodes > n or ", "if ", MALFORMED),
     (RECORD, " or block.steps > block.episodes * self.horizon", "", MALFORMED),
     (RECORD, "if not self.complete() or ", "if ", MALFORMED),
-    (RECORD, "(len(self.blocks) > 1 and Record", "(False and Record", MALFORMED),
+    (RECORD, "(len(self.blocks) > 1 and Record", "(False and Record", f"{BOUNDS}::test_blocks_beyond_those_that_the_rule_asks_for_are_refused"),
     (RECORD, "n == 0 or n >= self.episodes for n", "n >= self.episodes for n", BOUNDS),
     (RECORD, "drawn >= 3 * self.episodes", "drawn >= 4 * self.episodes", BOUNDS),
     (RECORD, "if drawn < self.episodes:\n            return False", "if drawn < self.episodes:\n            return True", BOUNDS),
@@ -70,7 +71,9 @@ MUTANTS = [
     (CERTIFICATE, "if depth > _DEPTH:", "if depth > 10**9:", NESTED),
     (CERTIFICATE, "if len(data) > _BYTES:", "if False:", MALFORMED),
     (CERTIFICATE, "if len(body) < len(pairs):", "if False:", MALFORMED),
-    (CERTIFICATE, "parse_constant=_no_constant, ", "", MALFORMED),
+    (CERTIFICATE, "parse_constant=_no_constant, ", "", MALFORMED,
+     "every number is looked at once more where it is used, as 1e999 is infinity without being a constant: the file is refused "
+     "all the same"),
     (CERTIFICATE, " or not body[name].isprintable()", "", MALFORMED),
     (CERTIFICATE, "or len(body[name]) > _TEXT ", "", MALFORMED),
     (CERTIFICATE, "is not (bool if decides else type(None))", "not in (bool, int, type(None))", MALFORMED),
@@ -103,10 +106,10 @@ MUTANTS = [
     # Counting.
     (BLOCKS, "\"left\": ((barrier > level + margin) & alive).any(0)", "\"left\": ((barrier > level + margin) & alive)[-1]", STEPS),
     (BLOCKS, "\"entered\": unsafe.any(0),", "\"entered\": unsafe.any(0) & False,", STEPS),
-    (BLOCKS, "\"aliased\": (unsafe & (barrier <= level - margin)).any(0),", "\"aliased\": (unsafe & (barrier < -9)).any(0),", STEPS),
+    (BLOCKS, "\"aliased\": (unsafe & (torch.minimum(barrier, seen) <= level - margin)).any(0),", "\"aliased\": (unsafe & (barrier < -9)).any(0),", STEPS),
     (BLOCKS, "(~barrier.isfinite() & alive).any(0) | ~worst.isfinite()", "~worst.isfinite()[:0].any() & (barrier[0] > 1e9)", f"{LOOPS}::test_no_number_is_an_event_and_no_way_to_stay_inside"),
     (BLOCKS, "torch.stack(list(events.values())).any(0)", "events[\"left\"]", STEPS),
-    (BLOCKS, "~(worst <= tolerated * (1 + slack))", "(worst > tolerated * (2 + slack))", STEPS),
+    (BLOCKS, "(error <= limit * (1 + slack))", "(error <= limit * (2 + slack))", STEPS),
     (BLOCKS, "found, worst = counted(run, self.level, self.tolerated)", "found, worst = counted(run, self.level + 9, self.tolerated)", STEPS),
     (BLOCKS, "before, after = self._entering(n // 2, g)", "before, after = uniform[: n // 2], uniform[: n // 2]", f"{LOOPS}::test_half_of_the_observations_of_u_are_where_it_is_entered"),
     (BLOCKS, "(int((~(unsafe > self.level - m)).sum()) for m", "(0 for m", f"{LOOPS}::test_half_of_the_observations_of_u_are_where_it_is_entered"),
@@ -135,7 +138,7 @@ MUTANTS = [
     (BLOCKS, "if not (isinstance(kind, type) and issubclass(kind, SafetyEnv)):", "if False:", f"{LOOPS}::test_the_system_of_a_description_is_one_of_the_library"),
     (CERTIFY, "s.kind if checked or s.kind == ASSUMED else \"claimed\"", "s.kind", f"{FORGED}::test_without_the_system_nothing_measured_is_printed_as_checked"),
     (CERTIFY, "except CheckpointError as error:\n        raise _Stop(Exit.AGENT", "except CheckpointError as error:\n        raise _Stop(Exit.REFUSED", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),
-    (CERTIFY, "signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))", "pass", f"{FORGED}::test_what_cannot_be_checked_in_the_time_is_not_called_wrong"),
+    (CERTIFY, "signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))", "pass", f"{FORGED}::test_a_proof_that_does_not_end_is_interrupted"),
     (CERTIFY, "if not plain or not all(type(v) in (int, float)", "if not plain or not all(True or type(v) in (int, float)", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),
     (BLOCKS, "all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(seen(env), seen(twin), strict=True))", "True", f"{LOOPS}::test_a_system_is_compared_with_its_description"),
 ]  # fmt: skip

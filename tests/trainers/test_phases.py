@@ -112,8 +112,8 @@ def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
 
 
 def test_a_checkpoint_of_other_settings_is_refused(uninterrupted):
-    path = uninterrupted[0].directory
-    with pytest.raises(CheckpointError, match=r"synthesis\.margin: 0\.05, now 0\.07"):
+    path, margin = uninterrupted[0].directory, uninterrupted[0].config.synthesis.margin
+    with pytest.raises(CheckpointError, match=rf"synthesis\.margin: {margin}, now 0\.07"):
         experiment(path, "synthesis.margin=0.07").train()
     assert experiment(path, "trainer.progress=false", "evaluation.seed=3").train() is not None  # these may change
 
@@ -229,6 +229,6 @@ def test_an_unknown_teacher_is_named():
 def test_training_sees_no_state(uninterrupted):
     """The phases work on latents of pictures, actions and labels; the store of the joint training holds no states."""
     found = uninterrupted[0]
-    assert set(found.work.latents) == {"latent", "next_latent", "action", "region"}
+    assert set(found.work.latents) == {"latent", "next_latent", "action", "region", "seen", "next_seen", "continues"}
     assert ("info", "state") not in found.store.get(torch.arange(2)).keys(True)
     assert not found.store.keep_state

@@ -48,6 +48,7 @@ def held_out(**parts: Any) -> _HeldOut:
         "episodes": episodes([[-0.4, -0.4, -0.3], [-0.3, -0.2, -0.2]]),
         "back": episodes([[0.5, 0.2, -0.1], [0.5, 0.4, 0.3]], [[2, 0, 0], [2, 2, 0]]),
     }
+    usual |= {"drift": torch.zeros(len(parts.get("episodes") or usual["episodes"])), "largest_innovation": 0.1}
     return _HeldOut(**(usual | parts))
 
 

@@ -79,7 +79,7 @@ def test_latents_are_the_encoders_whether_it_reads_frames_or_observations(encode
         torch.testing.assert_close(value, by_pixels[key], rtol=1e-4, atol=1e-5)
     # Within an episode (of two steps from S: none ends earlier) what follows is where the next transition begins.
     pairs = build(encoder, steps=2).random(64, 1, region=make().safe_set)
-    now, after = (pairs[k].reshape(8, -1, 2, 2) for k in ("latent", "next_latent"))
+    now, after = (pairs[k].reshape(8, -1, 2, 2) for k in ("seen", "next_seen"))
     found = (now[:, :, 1] - after[:, :, 0]).abs().amax(-1) < 1e-4
     assert found.float().mean() > 0.9
 
@@ -105,7 +105,7 @@ def test_the_same_seed_gives_the_same_transitions_and_another_index_others(encod
 def test_pictures_are_held_in_chunks_of_their_own_seeds(encoder, monkeypatch):
     monkeypatch.setattr(source, "_CHUNK", 16)
     found = build(encoder).random(40, 0)
-    assert len(found["latent"]) == len(found["region"]) == 40
+    assert len(found["seen"]) == len(found["region"]) == 40
     assert len(found["action"].unique()) == 40
 
 
@@ -127,10 +127,10 @@ def test_a_policy_is_followed_with_noise_on_its_actions(encoder):
     before = torch.get_rng_state()
     exact = found.under(policy, 40, 0, exploration=0.0)
     with torch.no_grad():
-        torch.testing.assert_close(exact["action"], policy(exact["latent"]), rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(exact["action"], policy(exact["seen"]), rtol=1e-4, atol=1e-4)
     noisy = found.under(policy, 400, 0, exploration=0.1)
     with torch.no_grad():
-        gap = noisy["action"] - policy(noisy["latent"])
+        gap = noisy["action"] - policy(noisy["seen"])
     assert float(gap.std()) == pytest.approx(1.0, rel=0.15)  # a tenth of half the range of the action
     assert torch.equal(torch.get_rng_state(), before), "the training's random numbers were touched"
     assert same(noisy, found.under(policy, 400, 0, exploration=0.1))
@@ -145,7 +145,7 @@ def test_without_a_store_nothing_is_stored_and_with_one_it_is_counted(encoder):
     assert same(kept, found._encode(store, torch.arange(80)))
     assert found.budget["transitions"] == 80
     few = found.stored(20)
-    assert len(few["latent"]) == 20
+    assert len(few["seen"]) == 20
     assert same(few, build(encoder, store=store).stored(20))
 
 

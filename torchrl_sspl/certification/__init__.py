@@ -13,10 +13,11 @@ from torchrl_sspl.certification.conditions import (
     find_counterexamples,
     largest_error,
     search_level,
+    tolerates,
 )
 from torchrl_sspl.certification.layers import deterministic_layer
 from torchrl_sspl.certification.record import Counts, Record
-from torchrl_sspl.certification.statistics import clopper_pearson, paper_layer, statistical_layer
+from torchrl_sspl.certification.statistics import clopper_pearson, paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.certification.vnnlib import export_vnnlib
 
 __all__ = [
@@ -39,6 +40,8 @@ __all__ = [
     "find_counterexamples",
     "largest_error",
     "paper_layer",
+    "run_time_layer",
     "search_level",
     "statistical_layer",
+    "tolerates",
 ]

@@ -63,6 +63,7 @@ class Problem:
     combine: str = "min"  # or "max", of the rows
     lipschitz: float | None = None  # proved Lipschitz constant of B
     inner: int | None = None  # step of F that holds d(z, pi(z)) where F ends with B
+    error: float = 0.0  # Euclidean norm up to which anything may be added to that step, as long as it stays in the domain
 
     @property
     def constrained(self) -> bool:
@@ -72,6 +73,14 @@ class Problem:
     def evaluate(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """Objective and barrier at points ``(n, p)``, each ``(n,)``."""
         barrier = self.barrier(point)
+        if self.error and self.inner is not None:
+            after = self.function.values(point)[self.inner]
+            with torch.enable_grad():
+                at = after.detach().requires_grad_()
+                (slope,) = torch.autograd.grad(self.barrier(at).sum(), at)
+            moved = after + self.error * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
+            value = self.barrier(torch.minimum(torch.maximum(moved, self.low), self.high))
+            return self.combined(value @ self.rows.mT - barrier * self.barrier_weight + self.constant), barrier[:, 0]
         return self.combined(self.function(point) @ self.rows.mT - barrier * self.barrier_weight + self.constant), barrier[:, 0]
 
     def combined(self, parts: Tensor) -> Tensor:
@@ -234,11 +243,12 @@ def _bound(
         for c in constraints:
             low, high = clip(low, high, c)
 
-    inner = Enclosure(q.function, low, high, until=q.inner, tight=tight)
+    ball = None if q.inner is None or not q.error else (q.inner, q.error)
+    inner = Enclosure(q.function, low, high, until=q.inner, tight=tight, ball=ball)
     first = torch.full((len(low), len(q.rows)), math.inf, dtype=low.dtype)
     if q.inner is not None and q.lipschitz is not None:
         least, most = inner.interval(q.inner)
-        reach = q.lipschitz * (0.5 * (most - least)).norm(dim=1)
+        reach = q.lipschitz * ((0.5 * (most - least)).norm(dim=1) + q.error)
         first = (q.barrier(0.5 * (least + most)) + reach[:, None]) @ q.rows.mT + q.constant
         if below is not None and bool(q.barrier_weight.any()):
             first = first + q.barrier_weight * below.at(inner.center).upper(inner.radius)

@@ -2,7 +2,8 @@
 
 The *paper* layer holds the paper's margins and on what share of samples its conditions hold with them. The
 *deterministic* layer is about the frozen networks alone: anybody can compute it again from the weights. The
-*statistical* layer is about fresh episodes and holds with a confidence. Every statement that does not hold is refused
+*statistical* layer is about fresh episodes and holds with a confidence. The *run-time* layer joins the two: to how many of
+these episodes the proof applies, by a premise that a robot can watch. Every statement that does not hold is refused
 with a reason and how far it misses.
 """
 
@@ -25,7 +26,7 @@ from torchrl_sspl.certification.record import Record, count, finite, keys
 from torchrl_sspl.certification.rounding import LOWER_BOUNDS, missed
 from torchrl_sspl.errors import CertificationError
 
-SCHEMA = 2
+SCHEMA = 3
 #: What a statement is; what is reported has a number and no verdict, and what is assumed has neither.
 PROVED, MEASURED, REPORTED, ASSUMED = "proved", "measured", "reported", "assumed"
 KINDS = (PROVED, MEASURED, REPORTED, ASSUMED)
@@ -58,6 +59,8 @@ class Reason(StrEnum):
     UNSAFE_INSIDE = "an unsafe observation lies in the set"
     EPISODES_LEAVE = "too many episodes leave the set"
     UNSAFE_ENTERED = "too many episodes leave the set or enter U"
+    PREMISE_NOT_MET = "in too many episodes the premise of the proof is not met at some step"
+    NOTHING_TOLERATED = "no error is proved to be tolerated: the proof applies to no episode"
     TOO_FEW = "too few episodes for the required bound"
     NOT_MEASURED = "nothing was measured"
     CALIBRATION_REUSED = "the episodes are not fresh: their seed or their observations were used before"
@@ -142,7 +145,7 @@ class Layer:
     """Statements of one layer.
 
     Attributes:
-        name: "paper", "deterministic" or "statistical".
+        name: "paper", "deterministic", "statistical" or "run-time".
         statements: in the order in which they are shown.
     """
 
@@ -253,7 +256,7 @@ class Certificate:
                 raise CertificationError(f"expected {name} to be 64 hexadecimal digits, received {str(body[name])[:40]!r}")
         level = finite("level", body["level"])
         record = None if body["record"] is None else Record.from_dict(body["record"])
-        measured = () if record is None else ("statistical", "paper")
+        measured = () if record is None else ("statistical", "run-time", "paper")
         layers = {}
         for name, part in keys("layers", body["layers"], ("deterministic", *measured)).items():
             part = keys("a layer", part, ("name", "statements", "verdict"))

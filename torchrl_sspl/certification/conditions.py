@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -53,15 +53,17 @@ class ClosedLoop:
         return self.barrier.input_dim
 
     def problem(
-        self, *, level: float | None, weight: tuple[float, ...] = (0.0,), constant: tuple[float, ...] = (0.0,)
+        self, *, level: float | None, weight: tuple[float, ...] = (0.0,), constant: tuple[float, ...] = (0.0,), error: float = 0.0
     ) -> Problem:
-        r"""Maximum of :math:`\min_k B(d(z, \pi(z))) - b_k B(z) + c_k` where B is at most a level, if one is given."""
+        r"""Maximum of :math:`\min_k B(d(z, \pi(z)) + e) - b_k B(z) + c_k` where B is at most a level, if one is given, over
+        all e up to an error that stay in the domain."""
         b, c = (torch.tensor(v, dtype=torch.float64) for v in (weight, constant))
         rows = torch.ones(len(weight), 1, dtype=torch.float64)
         # An infinite constant would turn the cheap tests into comparisons with infinity and NaN.
         known = self.lipschitz_bound if math.isfinite(self.lipschitz_bound) else None
         domain = self.low, self.high
-        return Problem(*domain, self.looped, rows, self.barrier, b, c, level=level, lipschitz=known, inner=self.inner)
+        of: dict[str, Any] = {"level": level, "lipschitz": known, "inner": self.inner, "error": error}
+        return Problem(*domain, self.looped, rows, self.barrier, b, c, **of)
 
 
 def closed_loop(
@@ -238,7 +240,7 @@ def decide_invariance(
         >>> [decide_invariance(loop, level=0.5, margin=m).status for m in (0.2, 0.3)]
         ['proved', 'refuted']
     """
-    terms: dict[str, dict[str, tuple[float, ...]]] = {
+    terms: dict[str, dict[str, Any]] = {
         "R3": dict(constant=(margin - level,)),
         "R1": dict(weight=(1.0 - decay,), constant=(margin,)),
         "R2": dict(weight=(1.0, 0.0), constant=(margin + decrement, margin + floor)),
@@ -298,6 +300,45 @@ def largest_error(
 def _below(value: float) -> float:
     """Less than what the last operations, exactly carried out, would give."""
     return value - 4.0 * math.ulp(value)
+
+
+def tolerates(
+    system: ClosedLoop,
+    error: float,
+    *,
+    level: float = 0.0,
+    barrier_rounding: float = 0.0,
+    step_rounding: float = 0.0,
+    budget: Budget | None = None,
+) -> Outcome:
+    r"""Decides whether :math:`\{B \le s\}` is kept whatever error of a size is added, by its own bounds in every direction.
+
+    .. math:: B(z) \le s + \epsilon_B, \; \lVert e \rVert \le \delta \;\Rightarrow\;
+        B(d(z, \pi(z)) + e) + L_B \epsilon_d + \epsilon_B \le s
+
+    :func:`largest_error` asks the same through the Lipschitz constant, as if the barrier rose by it everywhere and in every
+    direction at once.
+
+    Args:
+        system: the closed loop, with a finite Lipschitz bound.
+        error: :math:`\delta`, latent units.
+        level: s, barrier units.
+        barrier_rounding, step_rounding: :math:`\epsilon_B` and :math:`\epsilon_d` of the computed networks.
+        budget: when to give up.
+
+    Source: none.
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
+        >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
+        >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=9.0)
+        >>> [tolerates(loop, error, level=0.5).status for error in (0.24, 0.26)]
+        ['proved', 'refuted']
+    """
+    lost = system.lipschitz_bound * step_rounding + barrier_rounding if step_rounding + barrier_rounding > 0 else 0.0
+    inside = level + barrier_rounding + (SLACK if barrier_rounding else 0.0)
+    problem = system.problem(level=inside, constant=(lost - level,), error=error)
+    return maximise(problem, threshold=0.0, budget=budget)
 
 
 @dataclass(frozen=True)

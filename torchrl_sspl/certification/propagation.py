@@ -65,7 +65,9 @@ class Enclosure:
     """Bounds of the steps of a graph on boxes with corners ``(n, p)`` float64, up to the step ``until`` (the last one).
 
     Tight, the intervals of undecided activations are replaced by backward bounds: several times slower, much tighter on
-    large boxes and deep networks.
+    large boxes and deep networks. With ``ball``, a step and a radius, anything of at most this Euclidean norm may be added to
+    that step, an interface: it costs no dimension, as its share of a linear function is the radius times the norm of the
+    slope.
 
     Source: Zhang et al. 2018 (CROWN) for the backward bounds.
 
@@ -78,10 +80,18 @@ class Enclosure:
     """
 
     def __init__(
-        self, graph: Graph, low: Tensor, high: Tensor, *, until: int | None = None, tight: bool = False
+        self,
+        graph: Graph,
+        low: Tensor,
+        high: Tensor,
+        *,
+        until: int | None = None,
+        tight: bool = False,
+        ball: tuple[int, float] | None = None,
     ) -> None:
         _check_boxes(graph, low, high)
         self.graph, self.tight = graph, tight
+        self.ball = (-1, 0.0) if ball is None else ball
         self.center, self.radius = 0.5 * (low + high), 0.5 * (high - low)
         n, p = low.shape
         # Forms at which backward passes end: the input and the interfaces.
@@ -137,6 +147,8 @@ class Enclosure:
                 value += (c @ form.value[..., None])[..., 0]
                 if form.error is not None:
                     value += (c.abs() @ form.error[..., None])[..., 0]
+                if number == self.ball[0] and number < last:  # what is added belongs to the steps behind
+                    value += self.ball[1] * c.norm(dim=-1)
                 slope += c @ form.slope.mT
             elif isinstance(part, Affine):
                 value += c @ part.bias
@@ -167,7 +179,7 @@ class Enclosure:
     def select(self, index: Tensor) -> Enclosure:
         """The same bounds for some of the boxes."""
         part = object.__new__(Enclosure)
-        part.graph, part.tight, part._done = self.graph, self.tight, self._done
+        part.graph, part.tight, part.ball, part._done = self.graph, self.tight, self.ball, self._done
         part.center, part.radius = self.center[index], self.radius[index]
         part._forms = {k: f.select(index) for k, f in self._forms.items()}
         part._ends = {k: part._forms[k] for k in self._ends}
@@ -186,6 +198,9 @@ class Enclosure:
             if form.error is not None:
                 wide = form.error @ weight.abs().mT
                 error = wide if error is None else error.add_(wide)
+            if source == self.ball[0]:
+                wide = (self.ball[1] * weight.norm(dim=1)).expand(len(form.value), -1)
+                error = wide.clone() if error is None else error.add_(wide)
         assert slope is not None
         assert value is not None
         return _Form(slope, value, error)

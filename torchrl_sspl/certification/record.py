@@ -51,7 +51,9 @@ class Counts:
         aliased: how many showed an observation of U with B <= s.
         undefined: how many gave a barrier value or an error that is no number.
         events: how many did any of it.
-        exceeding: how many had an error above the tolerated one (all, where none is tolerated).
+        exceeding: how many did not meet the premise of the proof at every step: an error above the tolerated one (all,
+            where none is tolerated), or an observation with B > s by itself.
+        uncovered: of the steps, at how many the premise was not met.
         shown: observations of U, or episodes that show one.
         mistaken: of these, how many have B <= s.
         seen: latents of fresh observations.
@@ -66,6 +68,7 @@ class Counts:
     undefined: int
     events: int
     exceeding: int
+    uncovered: int
     shown: int
     mistaken: int
     seen: int
@@ -77,6 +80,8 @@ class Counts:
         parts = (self.left, self.entered, self.aliased, self.undefined)
         if not max(parts) <= self.events <= min(sum(parts), self.episodes) or self.exceeding > self.episodes:
             raise CertificationError(f"expected counts of events that fit each other, received {self}")
+        if not self.uncovered <= self.steps or bool(self.uncovered) > bool(self.exceeding):
+            raise CertificationError(f"expected no more steps without the premise than steps, received {self}")
         if self.mistaken > self.shown or self.outside > self.seen or self.aliased > self.entered:
             raise CertificationError(f"expected no more events than observations, received {self}")
 
@@ -84,7 +89,7 @@ class Counts:
         return Counts(*(getattr(self, f.name) + getattr(other, f.name) for f in fields(self)))
 
 
-NOTHING = Counts(*[0] * 12)
+NOTHING = Counts(*[0] * len(fields(Counts)))
 #: Numbers beside the counts, None where there is none: errors in latent units, the rest in units of the barrier.
 NUMBERS = (
     "episode_error", "largest_error", "covering_radius", "closed_loop_constant", "safe_worst", "unsafe_worst", "following_worst",

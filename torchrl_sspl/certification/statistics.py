@@ -110,7 +110,7 @@ def fingerprint(rows: Tensor, *, grid: float | None = None) -> list[str]:
     return [hashlib.blake2b(row.tobytes(), digest_size=16).hexdigest() for row in flat]
 
 
-def statistical_layer(record: Record, *, tolerated_error: float | None = None) -> Layer:
+def statistical_layer(record: Record) -> Layer:
     r"""What holds for fresh episodes, with which confidence; every word and number follows from the record.
 
     The unit is the episode: steps of one are not independent. An episode that leaves the set, enters U, shows an
@@ -121,14 +121,12 @@ def statistical_layer(record: Record, *, tolerated_error: float | None = None) -
 
     Args:
         record: how the episodes were drawn, and what was counted.
-        tolerated_error: proved, latent units; None where nothing was proved.
 
     Source: Clopper and Pearson (1934); the paper has no statistical statement.
 
     Example:
-        >>> counts = Counts(3000, 600000, 0, 0, 0, 0, 0, 0, 3000, 0, 9000, 0)
-        >>> record = Record("resets", "given", 7, 3000, 200, 3000, blocks=[counts])
-        >>> layer = statistical_layer(record, tolerated_error=0.1)
+        >>> counts = Counts(3000, 600000, 0, 0, 0, 0, 0, 0, 0, 3000, 0, 9000, 0)
+        >>> layer = statistical_layer(Record("resets", "given", 7, 3000, 200, 3000, blocks=[counts]))
         >>> layer.holds, round(layer["episodes"].value, 5)
         (True, 0.00123)
     """
@@ -165,7 +163,7 @@ def statistical_layer(record: Record, *, tolerated_error: float | None = None) -
     _share(layer, "unsafe observations", text, mistaken, m, each, record.acceptable, Reason.UNSAFE_INSIDE, detail)
     text = "both bounds hold at once (each bounds a share of its own kind; they are not added)"
     layer.state(REPORTED, "together", text, confidence=record.confidence)
-    _errors(layer, record, tolerated_error)
+    _errors(layer, record)
     layer.state(ASSUMED, "starts", f"episodes start as the measured ones did: {started}")
     layer.state(ASSUMED, "system", "camera, physics and appearance stay as they were")
     return layer
@@ -213,22 +211,57 @@ def _share(
     layer.state(MEASURED, name, text, holds, why, misses_by=None if holds else bound - acceptable, **of)
 
 
-def _errors(layer: Layer, record: Record, tolerated: float | None) -> None:
-    """How the errors compare with what is proved to be tolerated; reported, as nothing above rests on it."""
+def run_time_layer(record: Record, tolerated_error: float | None) -> Layer:
+    r"""To how many real episodes the proof applies, whatever camera and physics did in them.
+
+    The premise at a step: :math:`|\hat z_t - d(\hat z_{t-1}, u_{t-1})| \le \delta`, the correction of the observer,
+    and :math:`B(E(o_t)) \le s`; in an episode: at every step of it. It is watched at run time
+    (:class:`~torchrl_sspl.modules.controller.Controller`); with k episodes among n that do not meet it,
+    :math:`P \le \operatorname{Beta}^{-1}(c; k + 1, n - k)`.
+
+    Args:
+        record: how the episodes were drawn, and what was counted.
+        tolerated_error: :math:`\delta`, proved, latent units; None where nothing is.
+
+    Source: Theorem F of ``docs/theory.md``; none in the paper.
+
+    Example:
+        >>> counts = Counts(3000, 600000, 0, 0, 0, 0, 0, 3, 5, 3000, 0, 9000, 0)
+        >>> layer = run_time_layer(Record("resets", "given", 7, 3000, 200, 3000, blocks=[counts]), 0.01)
+        >>> layer.holds, round(layer["covered"].value, 5)
+        (True, 0.00258)
+    """
+    layer, total = Layer("run-time"), record.total
+    n = total.episodes - record.sizes["repeated"]
+    if not n:
+        layer.state(MEASURED, "covered", "episodes from {B <= s} were measured", False, Reason.NOT_MEASURED, n=0)
+        return layer
+    if tolerated_error is None or not tolerated_error > 0:
+        text = "the proof applies to episodes"
+        layer.state(MEASURED, "covered", text, False, Reason.NOTHING_TOLERATED, n=n)
+        return layer
+    exceeding = min(total.exceeding, n)
+    text = (
+        f"episodes of at most {record.horizon} steps from {{B <= s}} to which the proof does not apply from the first step to "
+        f"the last: {exceeding} of {n}; at most"
+    )
+    detail = f"acceptable {record.acceptable:g}"
+    _share(layer, "covered", text, exceeding, n, record.confidence, record.acceptable, Reason.PREMISE_NOT_MET, detail)
+    text = f"steps at which its premise is met: {total.steps - total.uncovered} of {total.steps}; steps are dependent, so no bound follows"
+    layer.state(REPORTED, "steps covered", text, n=total.steps)
+    text = (
+        f"the premise, watched at run time: no correction of the observer is above {down(tolerated_error)}, and B <= s for "
+        "every observation by itself; while it is met, B <= s whatever camera and physics do"
+    )
+    layer.state(ASSUMED, "premise", text)
+    return layer
+
+
+def _errors(layer: Layer, record: Record) -> None:
+    """How large the errors are; reported, as nothing above rests on it."""
     total, numbers = record.total, record.numbers
     n = total.episodes - record.sizes["repeated"]
     of: dict[str, Any] = {"n": n, "confidence": record.confidence}
-    if tolerated is None or tolerated <= 0:
-        text = "no error is proved to be tolerated, so the proof says nothing about episodes"
-        layer.state(REPORTED, "errors tolerated", text, n=n)
-    else:
-        exceeding = min(total.exceeding, n)
-        text = (
-            f"episodes with an error above the tolerated one of {down(tolerated)}, to which Theorem A does not apply: "
-            f"{exceeding} of {n}; at most"
-        )
-        bound = share_upper(exceeding, n, record.confidence)
-        layer.state(REPORTED, "errors tolerated", text, value=bound, unit="share", **of)
     if numbers["episode_error"] is not None:
         text = f"a share of at least {_QUANTILE:g} of the episodes has errors of at most"
         layer.state(REPORTED, "largest error", text, value=numbers["episode_error"], unit="latent", **of)

@@ -148,6 +148,12 @@ class SynthesisConfig:
     enabled: bool = _option(True, "whether they follow the joint training; never with loss.preset=paper, which trains "
         "as printed.")
     rounds: int = _option(1, "rounds of data, refit, synthesis and fine-tuning.")
+    gain: float = _option(1.0, "gain k of the latent observer: the latent is what was predicted, corrected by this share of "
+        "what is seen; 1: what is seen.")
+    gain_share: float = _option(1.0, "share of the gain with which the agent is checked and runs; below 1 the set was trained "
+        "with larger corrections than it meets.")
+    episode_steps: int | None = _option(None, "longest episode of the transitions collected for these phases; null is "
+        "collector.max_frames_per_traj. An observer learns from episodes, not from single steps.")
     transitions: int = _option(40_000, "encoded transitions of the first round: those of the joint training and, "
         "where the environment knows its sets, further ones under random actions. Of more than that, all that start "
         "in S or U, at most half of them, and others at random.")
@@ -163,6 +169,9 @@ class SynthesisConfig:
         "where what is seen there is not worth the networks' capacity (a robot before the obstacle it stands on).")
     tube_radius: float = _option(0.3, "distance from the data up to which a latent off the manifold may belong to the "
         "safe set.")
+    tolerated_error: float = _option(0.0, "error per step that the set is meant to be proved to tolerate, latent units: the "
+        "invariant set of the data keeps so much and half as much again, and after the fine-tuning the counterexamples of "
+        "the proof go back into the training. 0: residual_spread counts, and nothing is asked of the proof.")
     residuals: int = _option(16, "observed errors of the dynamics per latent that the fine-tuning adds to successors.")
     residual_spread: float = _option(1.5, 'standard deviations of the local error that the invariant set of the data '
         'tolerates; with teacher "value" lowered by quarters where nine tenths of S could not be kept otherwise.')
@@ -178,6 +187,7 @@ class SynthesisConfig:
     fit_steps: int = _option(1500, "steps in which barrier and policy are regressed onto their targets.")
     steer_steps: int = _option(300, "steps of the policy alone on the condition, with the barrier held still.")
     tune_steps: int = _option(3000, "steps of the joint fine-tuning on the losses of the condition.")
+    tighten_steps: int = _option(2000, "steps on counterexamples of the proof, where tolerated_error is positive.")
     margin: float = _option(0.1, "margin m of the condition R3, B <= 0 implies B(d(z, pi(z))) + m <= 0.")
     band: float = _option(0.1, "barrier value up to which R3 is asked.")
     batch: int = _option(512, "latents per step.")
@@ -190,6 +200,8 @@ class SynthesisConfig:
         "barrier).")
     leave_share: float = _option(0.00075, "largest share of the held-out episodes of a round that may leave the set; "
         "none may touch U.")
+    cover_share: float = _option(0.0, "share of the held-out episodes to which the proof has to apply from the first step "
+        "to the last; sets that reach it are preferred to all others. 0: no proof is tried before the end.")
     return_share: float = _option(0.97, "share of the held-out episodes from U that should end in the set; among sets "
         "that pass, one that reaches it is preferred to a larger one that does not.")
     check_episodes: int = _option(4000, "held-out episodes of a round's check, where the environment knows its sets.")

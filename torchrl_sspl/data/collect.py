@@ -6,6 +6,7 @@ import contextlib
 import copy
 import functools
 import multiprocessing
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -22,6 +23,7 @@ from torchrl_sspl.sets import Region
 
 BACKENDS = ("sync", "process", "ray")
 _BATCH = 2048  # transitions at a time; an episode that a batch cuts in two costs two frames more
+_EPISODE = 64  # steps up to which no episode is cut
 
 
 class RandomActions(TensorDictModuleBase):
@@ -74,6 +76,8 @@ class ExploringPolicy(TensorDictModuleBase):
         low, high: bounds of the action ``(action_dim,)``.
         exploration: standard deviation of the noise, as a share of the half range.
         random_share: share of the environments with uniformly random actions; of a single one, share of the steps.
+        predict: what a policy with memory expects to see next, from the action that is taken
+            (:class:`~torchrl_sspl.modules.Predict`).
 
     Source: none.
     """
@@ -81,17 +85,27 @@ class ExploringPolicy(TensorDictModuleBase):
     low: Tensor
     high: Tensor
 
-    def __init__(self, policy: nn.Module, low: Tensor, high: Tensor, exploration: float, random_share: float) -> None:
+    def __init__(
+        self,
+        policy: nn.Module,
+        low: Tensor,
+        high: Tensor,
+        exploration: float,
+        random_share: float,
+        predict: TensorDictModuleBase | None = None,
+    ) -> None:
         super().__init__()
-        self.in_keys, self.out_keys = ["pixels"], ["action"]
-        self.policy, self.exploration, self.random_share = policy, exploration, random_share
+        self.in_keys = list(getattr(policy, "in_keys", ["pixels"]))
+        self.out_keys: list[Any] = ["action", *([] if predict is None else predict.out_keys)]
+        self.policy, self.exploration, self.random_share, self.predict = policy, exploration, random_share, predict
         self.register_buffer("low", low.clone())
         self.register_buffer("high", high.clone())
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"`` ``(*batch, action_dim)``."""
-        action = self.policy(tensordict.select("pixels"))["action"]
+        decided = self.policy(tensordict.select(*self.in_keys))
+        action = decided["action"]
         half = (self.high - self.low) / 2
         noisy = action + self.exploration * half * torch.randn_like(action)
         uniform = self.low + (self.high - self.low) * torch.rand_like(action)
@@ -100,7 +114,10 @@ class ExploringPolicy(TensorDictModuleBase):
             swap = (torch.arange(n, device=action.device) < round(self.random_share * n)).reshape(-1, *[1] * (action.ndim - 1))
         else:
             swap = torch.rand_like(action[..., :1]) < self.random_share
-        return tensordict.set("action", torch.where(swap, uniform, noisy.clamp(self.low, self.high)))
+        decided["action"] = torch.where(swap, uniform, noisy.clamp(self.low, self.high))
+        if self.predict is not None:
+            decided = self.predict(decided)
+        return tensordict.update(decided.select(*self.out_keys))
 
 
 def collect_random(
@@ -164,15 +181,19 @@ def collect_rollouts(
     if isinstance(env, EnvBase) and seed is not None:
         env.set_seed(seed)  # before the collector resets it
     width = (env if isinstance(env, EnvBase) else env()).numel()
-    options = {"backend": "direct", "frames_per_batch": max(1, min(-(-n // width), _BATCH // width)) * width}
+    at_once = max(_BATCH // width, min(steps or 1, _EPISODE))
+    options = {"backend": "direct", "frames_per_batch": max(1, min(-(-n // width), at_once)) * width}
     options.update(collector)
     if options["backend"] == "direct":
         options.setdefault("return_same_td", True)  # what is collected is copied into the store at once
     with _starting_in(env, region):
-        source = Collector(
-            env, policy, total_frames=-1, max_frames_per_traj=steps, auto_register_policy_transforms=False,
-            trust_policy=True, **options,
-        )  # fmt: skip
+        with warnings.catch_warnings():
+            # Step counter and memory are two transforms of one environment, which is what TorchRL makes of them.
+            warnings.filterwarnings("ignore", "Nested TransformedEnvs", UserWarning)
+            source = Collector(
+                env, policy, total_frames=-1, max_frames_per_traj=steps, trust_policy=True,
+                auto_register_policy_transforms="prior" in getattr(policy, "in_keys", ()), **options,
+            )  # fmt: skip
         try:
             if seed is not None and not isinstance(env, EnvBase):
                 source.set_seed(seed)

@@ -286,6 +286,15 @@ class TransitionStore(Storage):
         return (index >= 0) & (index < self._len)
 
 
+def continues(store: TransitionStore, index: Tensor) -> Tensor:
+    """Whether transitions at positions ``(k,)`` go on where the one before them in the store ends, ``(k,)`` bool.
+
+    Source: none.
+    """
+    triple = store._columns["triple"]
+    return (triple[index, :2] == triple[index - 1, 1:]).all(1) & (index > 0)
+
+
 def _column(name: str, rows: Tensor, size: int) -> Tensor:
     """Room for a column of the store whose rows are like these."""
     return torch.full((size, *rows.shape[1:]), -1 if name == "triple" else 0, dtype=rows.dtype)
@@ -397,4 +406,4 @@ class RegionSampler(Sampler):
         """Nothing to forget."""
 
 
-__all__ = ["RegionSampler", "TransitionStore"]
+__all__ = ["RegionSampler", "TransitionStore", "continues"]

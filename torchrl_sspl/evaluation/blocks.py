@@ -125,18 +125,24 @@ class Block:
 def counted(e: Episodes, level: float, tolerated: float | None, slack: float = 0.0) -> tuple[dict[str, int], Tensor]:
     """Events by name, by more than a share of the barrier's range, and the largest error of each episode ``(n,)``."""
     alive, barrier, unsafe = e.alive, e.barrier.double(), (e.region == UNSAFE) & e.alive
+    seen = e.seen.double()
     error = torch.where(alive[1:], e.prediction_error.double(), 0.0)
     worst = torch.where(error.isnan(), math.inf, error).amax(0)
     margin = slack * _range(barrier[alive], level)
     events = {
         "left": ((barrier > level + margin) & alive).any(0),
         "entered": unsafe.any(0),
-        "aliased": (unsafe & (barrier <= level - margin)).any(0),
+        "aliased": (unsafe & (torch.minimum(barrier, seen) <= level - margin)).any(0),
         "undefined": (~barrier.isfinite() & alive).any(0) | ~worst.isfinite(),
     }
     events["events"] = torch.stack(list(events.values())).any(0)
-    exceeding = torch.ones_like(worst, dtype=torch.bool) if tolerated is None else ~(worst <= tolerated * (1 + slack))
-    return {k: int(v.sum()) for k, v in events.items()} | {"exceeding": int(exceeding.sum())}, worst
+    limit = 0.0 if tolerated is None else tolerated
+    met = (error <= limit * (1 + slack)) & (seen[1:] <= level + margin) & torch.tensor(limit > 0.0)
+    missing = ~met & alive[1:]
+    # An episode without a step has nothing to show but its first observation.
+    exceeding = missing.any(0) | ~((seen[0] <= level + margin) & torch.tensor(limit > 0.0))
+    sums = events | {"exceeding": exceeding, "uncovered": missing}
+    return {k: int(v.sum()) for k, v in sums.items()}, worst
 
 
 def _range(barrier: Tensor, level: float) -> float:

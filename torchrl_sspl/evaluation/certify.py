@@ -32,12 +32,12 @@ from torchrl_sspl.certification.certificate import (
     differences,
     weights_digest,
 )
-from torchrl_sspl.certification.conditions import closed_loop
+from torchrl_sspl.certification.conditions import closed_loop, tolerates
 from torchrl_sspl.certification.floating import UNITS, largest_rounding
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
 from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.rounding import missed, shown
-from torchrl_sspl.certification.statistics import paper_layer, statistical_layer
+from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CertificationError, CheckpointError, SSPLError
 from torchrl_sspl.evaluation.blocks import (
@@ -55,7 +55,11 @@ from torchrl_sspl.modules.agent import Agent, agent_directory
 CERTIFICATE_FILE = "certificate.json"
 _BROKEN = (SSPLError, ImportError, RuntimeError, TypeError, ValueError)
 #: What a certificate is about; everything else in the description (the certificate's own traces, notes) may change.
-_CERTIFIED_KEYS = ("networks", "config", "training", "lipschitz", "seeds", "environment", "trained_on")
+_CERTIFIED_KEYS = ("networks", "config", "training", "lipschitz", "seeds", "environment", "trained_on", "tolerated_error")
+
+
+#: How far beyond the Lipschitz argument a tolerated error is looked for, in how many steps, and with how many boxes each.
+_FARTHEST, _HALVINGS, _PATIENCE = 1.7, 4, 50_000
 
 
 class Exit(IntEnum):
@@ -158,7 +162,7 @@ def certify_on_episodes(
         >>> from torchrl_sspl.modules.agent import load
         >>> certificate = certify_on_episodes(load("pendulum"), PendulumEnv, episodes=4, horizon=3, envs=4)
         >>> sorted(certificate.layers)
-        ['deterministic', 'paper', 'statistical']
+        ['deterministic', 'paper', 'run-time', 'statistical']
     """
     factory = described_system(agent.description)
     system = "described" if factory is not None and same_resets(make_env, factory) else "given"
@@ -239,8 +243,46 @@ def _loop(agent: Agent) -> dict[str, Any]:
     return {"barrier": agent.barrier, "dynamics": agent.dynamics, "policy": agent.policy, **sizes}
 
 
-def _proof(agent: Agent, level: float, budget: Budget) -> Layer:
-    return deterministic_layer(**_loop(agent), level=level, multipliers=_witness(agent), budget=budget)
+def _proof(agent: Agent, level: float, budget: Budget, required: float | None = None) -> Layer:
+    """What the weights prove; the error that the agent's run-time monitor tolerates is required to be tolerated."""
+    required = agent.tolerated_error if required is None else required
+    return deterministic_layer(
+        **_loop(agent), level=level, required_error=required, multipliers=_witness(agent), budget=budget
+    )
+
+
+def premise(agent: Agent, *, budget: Budget | None = None) -> float:
+    """Error per step that {B <= 0} is proved to tolerate, by the numbers that the agent computes; 0 where it is not kept.
+
+    This is what an agent's run-time monitor compares with: put it into ``agent.description["tolerated_error"]``. It is a
+    thousandth smaller than what was found, so that another machine finds it, too. Source: none.
+
+    Args:
+        agent: frozen agent.
+        budget: of each search; 60 s by default.
+
+    Example:
+        >>> from torchrl_sspl.modules.agent import load
+        >>> premise(load("pendulum"), budget=Budget(boxes=1))  # nothing is proved with so little effort
+        0.0
+    """
+    budget = budget or Budget(seconds=60.0)
+    layer = _proof(agent, 0.0, budget, required=0.0)
+    found = next((s.value for s in layer.statements if s.name in ("float32", "float64")), None)
+    if not layer.holds or found is None:
+        return 0.0
+    system, unit = closed_loop(**_loop(agent)), UNITS[next(agent.barrier.parameters()).dtype]
+    names = {"barrier_rounding": system.barrier, "step_rounding": system.step}
+    rounding = {k: largest_rounding(graph, system.low, system.high, unit) for k, graph in names.items()}
+    low, high = 0.999 * found, _FARTHEST * found
+    budget = replace(budget, boxes=min(budget.boxes, _PATIENCE))
+    for _ in range(_HALVINGS):  # the Lipschitz constant says too little where the barrier rises slowly
+        middle = math.sqrt(low * high)
+        if tolerates(system, middle, budget=budget, **rounding).status == "proved":
+            low = middle
+        else:
+            high = middle
+    return 0.999 * low
 
 
 def _witness(agent: Agent) -> list[Tensor] | None:
@@ -259,7 +301,7 @@ def _witness(agent: Agent) -> list[Tensor] | None:
 
 def _measured(certificate: Certificate, agent: Agent, source: Any, progress: bool) -> Certificate:
     """The certificate with the layers that follow from blocks, drawn until there are enough."""
-    source.tolerated = _tolerated(certificate)
+    source.tolerated = _tolerated(certificate, agent)
     record, blocks = source.record, list[Block]()
     with tqdm(desc="certificate", unit="block", disable=not progress, leave=False) as bar:
         while not record.complete():
@@ -273,14 +315,18 @@ def _measured(certificate: Certificate, agent: Agent, source: Any, progress: boo
     return certificate
 
 
-def _tolerated(certificate: Certificate) -> float | None:
+def _tolerated(certificate: Certificate, agent: Agent) -> float | None:
+    """Error above which the proof does not apply: that of the agent's monitor, or what is proved where it has none."""
     proof = certificate.layers["deterministic"]
-    return next((s.value for s in proof.statements if s.name == TOLERATED), None)
+    if not proof.holds:
+        return None
+    return agent.tolerated_error or next((s.value for s in proof.statements if s.name == TOLERATED), None)
 
 
 def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> dict[str, Layer]:
     return {
-        "statistical": statistical_layer(record, tolerated_error=_tolerated(certificate)),
+        "statistical": statistical_layer(record),
+        "run-time": run_time_layer(record, _tolerated(certificate, agent)),
         "paper": paper_layer(record, agent.lipschitz_bound),
     }
 
@@ -460,7 +506,7 @@ def _measured_again(
     kind: Any = StateBlocks if record.kind == "states" else ResetBlocks
     if (record.kind == "states") != isinstance(env, SafetyEnv):
         raise _Stop(Exit.REFUSED, f"FAILED {Reason.RECORD_CHANGED.name}: the episodes are of another kind of system")
-    source = kind(agent, env, record, claimed.level, _tolerated(claimed))
+    source = kind(agent, env, record, claimed.level, _tolerated(claimed, agent))
     order, began = list(range(len(record.blocks))), time.monotonic()
     random.SystemRandom().shuffle(order)
     blocks: dict[int, Block] = {}
@@ -490,7 +536,7 @@ def _block_changes(claimed: Counts, block: Block) -> str:
     longest = int(block.steps.max()) if len(block.steps) else 0
     slack = {"episodes": close, "shown": close, "steps": close * longest, "seen": close * (longest + 1)}
     wrong = [k for k, most in slack.items() if abs(getattr(claimed, k) - found[k]) > most]
-    events = ("left", "entered", "aliased", "undefined", "events", "exceeding", "mistaken", "outside")
+    events = ("left", "entered", "aliased", "undefined", "events", "exceeding", "uncovered", "mistaken", "outside")
     wrong += [k for k in events if getattr(claimed, k) < max(least[k], found[k] - 1)]
     return ", ".join(f"{k} claimed {getattr(claimed, k)}, measured {found[k]}" for k in wrong)
 
@@ -523,7 +569,7 @@ def _print(claimed: Certificate, unmeasured: str, report: Callable[[str], None])
     for layer in claimed.layers.values():
         proof = layer.name == "deterministic"
         checked = "checked again" if proof or not unmeasured else f"not checked again ({unmeasured})"
-        if layer.name == "statistical" and unmeasured.endswith("at random"):
+        if layer.name in ("statistical", "run-time") and unmeasured.endswith("at random"):
             checked = f"checked again on {unmeasured}"
         report(f"{layer.name:14s} {checked}: {layer.verdict}")
         for s in layer.statements:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation.measurements import Draw
 from torchrl_sspl.modules.agent import Agent, hosted
+from torchrl_sspl.modules.controller import Memory
 
 CHUNK = 1000  # frames drawn and encoded at a time
 _NONE: Any = None
@@ -25,7 +26,9 @@ class Decision:
 
     action: Tensor = _NONE  # (n, m), physical units
     barrier: Tensor = _NONE  # (n,), at most zero means safe
+    seen: Tensor = _NONE  # (n,) barrier of what is seen by itself, without memory
     latent: Tensor = _NONE  # (n, p)
+    innovation: Tensor = _NONE  # (n, p) what is seen, less what was expected
     predicted: Tensor = _NONE  # (n, p) the next latent that it expects
     predicted_barrier: Tensor = _NONE  # (n,) barrier of the latter
 
@@ -104,7 +107,8 @@ class Camera:
 
 
 class AgentController:
-    """An agent in a closed loop; of a film of states every frame is encoded once, where the encoder can. Source: none.
+    """An agent in a closed loop, its latent observer with it; of a film of states every frame is encoded once, where the
+    encoder can. Source: none.
 
     Args:
         agent: frozen agent; its encoder stays on its device.
@@ -127,40 +131,48 @@ class AgentController:
         #: Whether ``step`` takes a camera, too.
         self.streams = self.driver is None or getattr(self.driver, "streams", False)
         self._split = hasattr(agent.encoder, "frames") and hasattr(agent.encoder, "head")
+        self._memory = Memory(self.agent.gain)
         self.reset()
 
     def reset(self, rows: Tensor | None = None) -> None:
         """Forget; see :class:`Controller`."""
         if rows is None:
-            self._latent: Tensor | None = None
+            self._seen: Tensor | None = None
             self._features: Tensor | None = None
             self._action: Tensor | None = None
+        self._memory.forget(rows)
         if self.driver is not None:
             self.driver.reset(rows)
 
     @torch.no_grad()
     def watch(self, observation: Tensor | Camera, rows: Tensor | None = None) -> Decision:
         """Latents and barrier values of observations; arguments as for :meth:`step`."""
-        latent = self._see(observation, rows)
-        return Decision(barrier=self.agent.barrier(latent)[:, 0], latent=latent).rows(rows)
+        return self._judge(observation, rows).rows(rows)
 
     @torch.no_grad()
     def step(self, observation: Tensor | Camera, rows: Tensor | None = None) -> Decision:
         """Actions, barrier values and predictions for observations ``(k, 6, H, W)`` or a camera."""
         # All n at a time: a row's result does not depend on how many others are asked for.
-        latent, agent = self._see(observation, rows), self.agent
+        agent, decision = self.agent, self._judge(observation, rows)
         if self.driver is None:
-            action = agent.policy(latent)
+            action = agent.policy(decision.latent)
         else:
             chosen = self.driver.step(observation, rows).action  # type: ignore[arg-type]
             action = chosen if rows is None or self._action is None else self._action.index_copy(0, rows, chosen)
             self._action = action
-        predicted = agent.dynamics(latent, action)
-        values = agent.barrier(latent)[:, 0], agent.barrier(predicted)[:, 0]
-        return Decision(action, values[0], latent, predicted, values[1]).rows(rows)
+        predicted = agent.dynamics(decision.latent, action)
+        self._memory.expect(predicted, rows)
+        expected = {"predicted": predicted, "predicted_barrier": agent.barrier(predicted)[:, 0]}
+        return replace(decision, action=action, **expected).rows(rows)
+
+    def _judge(self, observation: Tensor | Camera, rows: Tensor | None) -> Decision:
+        """What is thought of all n episodes after a look at some of them."""
+        seen, barrier = self._see(observation, rows), self.agent.barrier
+        latent, innovation = self._memory.correct(seen)
+        return Decision(barrier=barrier(latent)[:, 0], seen=barrier(seen)[:, 0], latent=latent, innovation=innovation)
 
     def _see(self, observation: Tensor | Camera, rows: Tensor | None) -> Tensor:
-        """Latents of all n episodes, after a look at some of them."""
+        """Encoded observations of all n episodes, after a look at some of them."""
         agent = self.agent
         if isinstance(observation, Tensor):
             latent = agent.encode(observation.to(self._device))
@@ -173,9 +185,9 @@ class AgentController:
             self._features[observation.rows] = seen
         else:
             latent = torch.cat([agent.encode(part) for part in observation.pixels()])
-        if rows is not None and self._latent is not None:
-            latent = self._latent.index_copy(0, rows, latent)
-        self._latent = latent
+        if rows is not None and self._seen is not None:
+            latent = self._seen.index_copy(0, rows, latent)
+        self._seen = latent
         return latent
 
 

@@ -29,10 +29,12 @@ class Episodes:
         region: ``(T + 1, n)`` int64 labels of the true states.
         alive: ``(T + 1, n)`` whether the observation belongs to the episode; the one in which it ends does.
         states: ``(T + 1, n, s)`` true states, where the environment tells them.
-        barrier: ``(T + 1, n)`` barrier value of what was observed; None without a barrier, as what follows.
+        barrier: ``(T + 1, n)`` barrier value B(z_t) of the latent; None without a barrier, as what follows.
+        seen: ``(T + 1, n)`` B(E(o_t)), of what was observed by itself.
         latent: ``(T + 1, n, p)``.
-        prediction_error: ``(T, n)`` norm of E(o_{t+1}) - d(z_t, u_t).
-        barrier_error: ``(T, n)`` B(E(o_{t+1})) - B(d(z_t, u_t)).
+        innovation: ``(T + 1, n, p)`` E(o_t) less what was expected; zero where an episode begins.
+        prediction_error: ``(T, n)`` norm of z_{t+1} - d(z_t, u_t), of which without an observer z_{t+1} = E(o_{t+1}).
+        barrier_error: ``(T, n)`` B(z_{t+1}) - B(d(z_t, u_t)).
         frames: ``(T + 1, k, 3, H, W)`` uint8 what the first k episodes showed, where asked for.
         events: ``(n,)`` bool by name: what happened in an episode, such as "left" or "hit".
     """
@@ -42,7 +44,9 @@ class Episodes:
     alive: Tensor
     states: Tensor = _NONE
     barrier: Tensor = _NONE
+    seen: Tensor = _NONE
     latent: Tensor = _NONE
+    innovation: Tensor = _NONE
     prediction_error: Tensor = _NONE
     barrier_error: Tensor = _NONE
     frames: Tensor = _NONE
@@ -155,10 +159,10 @@ class _Record:
 
     def judge(self, decision: Decision, region: Tensor, alive: Tensor, gone: Tensor | None = None) -> None:
         """An observation, and what is thought of it; of whoever is gone nothing."""
-        barrier = decision.barrier
-        if barrier is not None and gone is not None:
-            barrier = barrier.masked_fill(gone, -1.0)
-        self.add(region=region, alive=alive.clone(), barrier=barrier, latent=decision.latent)
+        values = {"barrier": decision.barrier, "seen": decision.seen}
+        if gone is not None:
+            values = {k: None if v is None else v.masked_fill(gone, -1.0) for k, v in values.items()}
+        self.add(region=region, alive=alive.clone(), latent=decision.latent, innovation=decision.innovation, **values)
 
     def compare(self, before: Decision, after: Decision, gone: Tensor | None = None) -> None:
         """How far a step led from where it was expected to."""

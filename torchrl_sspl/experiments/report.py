@@ -10,6 +10,7 @@ from typing import Any
 import torch
 
 from torchrl_sspl.certification.certificate import Certificate
+from torchrl_sspl.certification.rounding import down
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.evaluation.outcome import Outcome
@@ -259,8 +260,14 @@ def _headline(certificate: Certificate | None) -> tuple[str, str]:
         layer = certificate.layers.get(name)
         if layer is not None and not layer.holds:
             return f"{name.capitalize()} layer {layer.verdict}", "bad"
-    measured = "statistical" in certificate.layers
-    return ("Certified: proved and measured", "good") if measured else ("Proved, and not measured", "fair")
+    covered = certificate.layers.get("run-time")
+    if covered is None:
+        return "Proved, and not measured", "fair"
+    missed = covered["covered"].value
+    if missed is None:
+        return "Proved and measured; the proof applies to no real episode", "fair"
+    reach = f"the proof covers at least {down(100 * (1 - missed), 4)} % of real episodes"
+    return f"Certified: {reach}", "good" if covered.holds else "fair"
 
 
 __all__ = ["REPORT_FILE", "draw_figures", "write_run_report"]

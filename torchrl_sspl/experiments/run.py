@@ -30,7 +30,7 @@ from torchrl_sspl.data.collect import ExploringPolicy, RandomActions, make_colle
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError, EmptyRegionError, MissingDependencyError
-from torchrl_sspl.evaluation.certify import CERTIFICATE_FILE, certify, certify_on_episodes
+from torchrl_sspl.evaluation.certify import CERTIFICATE_FILE, certify, certify_on_episodes, premise
 from torchrl_sspl.evaluation.episodes import evaluate_episodes, logged
 from torchrl_sspl.evaluation.known import evaluate
 from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
@@ -164,7 +164,8 @@ class Experiment:
     def _workspace(self) -> Workspace:
         c, seed = self.config.collector, self.config.seed
         source = Source(
-            self.make_env, self.encoder, store=self.store, starts=c.starts, steps=c.max_frames_per_traj,
+            self.make_env, self.encoder, store=self.store, starts=c.starts,
+            steps=self.config.synthesis.episode_steps or c.max_frames_per_traj,
             envs=256 if self.known else c.envs, seed=seed,
         )  # fmt: skip
         body = self.config.to_dict()
@@ -252,7 +253,8 @@ class Experiment:
     def agent(self) -> Agent:
         """A frozen copy of the present networks, their level placed where the phases have put it."""
         nets = self.encoder, self.dynamics, self.barrier, self.policy
-        return Agent.from_networks(*nets, level=self.work.level, description=self.work.description)
+        options: dict[str, Any] = {"level": self.work.level, "gain": self.work.running_gain, "description": self.work.description}
+        return Agent.from_networks(*nets, **options)
 
     def train(self, *, resume: bool = True) -> Agent:
         """Train, or go on from the last checkpoint in the directory if ``resume``.
@@ -281,6 +283,7 @@ class Experiment:
             ) from error
         agent = self.agent()
         agent.description["stop_reason"] = self.stop_reason()
+        agent.description["tolerated_error"] = premise(agent, budget=Budget(seconds=self.config.evaluation.certificate_seconds))
         agent.save(self.directory / "agent")
         return agent
 

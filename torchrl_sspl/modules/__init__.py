@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
+from torchrl_sspl.modules.observer import LatentObserver, Predict
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
 
 __all__ = [
     "FrameEncoder",
     "InverseDynamics",
     "LatentDynamics",
+    "LatentObserver",
     "MomentEncoder",
     "Policy",
+    "Predict",
     "SaLaD",
     "as_tensordict_module",
     "inward_clamp",

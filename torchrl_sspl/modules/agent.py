@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import json
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,8 +20,10 @@ from torchrl_sspl.configs.reader import resolve
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.lipschitz import prove_lipschitz
+from torchrl_sspl.modules.controller import Controller
 from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
+from torchrl_sspl.modules.observer import gain_matrix
 
 WEIGHTS_FILE = "agent.safetensors"
 DESCRIPTION_FILE = "agent.json"
@@ -47,7 +50,8 @@ class Agent(nn.Module):
     r"""A frozen safe agent: :math:`z = E(o)`, :math:`B(z)`, :math:`u = \pi(z)`, :math:`z^+ = d(z, u)`.
 
     The networks are in evaluation mode and take no gradient. ``barrier``, ``policy`` and ``dynamics`` are
-    modules and are called as such. Source: paper Section IV (the trained networks); deviation: none.
+    modules and are called as such; :meth:`controller` runs them behind the observer. Source: paper Section IV (the
+    trained networks); deviation: the latent observer, see :class:`~torchrl_sspl.modules.observer.LatentObserver`.
 
     Args:
         encoder: pixels ``(*batch, 6, H, W)`` uint8 -> latent ``(*batch, p)`` in [-1, 1].
@@ -55,7 +59,11 @@ class Agent(nn.Module):
         barrier: latent ``(*batch, p)`` -> ``(*batch, 1)``; at most zero means safe.
         policy: latent ``(*batch, p)`` -> action ``(*batch, m)`` in physical units (N m, rad/s).
         lipschitz_bound: the proved Lipschitz constant of ``barrier`` with respect to the Euclidean norm.
-        description: how to build the networks again, and whatever else should travel with the agent.
+        description: how to build the networks again, and whatever else should travel with the agent;
+            ``"tolerated_error"`` is the error below which its proof applies at run time.
+        gain: K of the latent observer, a number or ``(p, p)``; 1: the latent is what is seen.
+
+    Raises ConfigError for a gain or a tolerated error that is not valid.
 
     Example:
         >>> agent = Agent(FrameEncoder(2, 32), LatentDynamics(2, 1), mlp_barrier(2, [8]), Policy(2, 1), 2.0)
@@ -63,6 +71,8 @@ class Agent(nn.Module):
         >>> agent.barrier(latent).shape, agent.dynamics(latent, agent.policy(latent)).shape
         (torch.Size([4, 1]), torch.Size([4, 2]))
     """
+
+    gain: Tensor
 
     def __init__(
         self,
@@ -72,11 +82,16 @@ class Agent(nn.Module):
         policy: nn.Module,
         lipschitz_bound: float,
         description: dict[str, Any] | None = None,
+        gain: float | Tensor = 1.0,
     ) -> None:
         super().__init__()
         self.encoder, self.dynamics, self.barrier, self.policy = encoder, dynamics, barrier, policy
         self.lipschitz_bound = float(lipschitz_bound)
         self.description: dict[str, Any] = dict(description or {})
+        self.register_buffer("gain", gain_matrix(gain, self.latent_dim))
+        error = self.description.get("tolerated_error", 0.0)
+        if type(error) not in (int, float) or not 0.0 <= error < math.inf:
+            raise ConfigError(f"expected a tolerated error that is finite and not negative, received {str(error)[:40]!r}")
         self.eval()
         self.requires_grad_(False)
 
@@ -89,6 +104,7 @@ class Agent(nn.Module):
         policy: nn.Module,
         *,
         level: float = 0.0,
+        gain: float | Tensor = 1.0,
         description: dict[str, Any] | None = None,
     ) -> Agent:
         """A frozen copy, on the CPU, of networks in training; the barrier collapsed to a plain one, its bound proved.
@@ -97,6 +113,7 @@ class Agent(nn.Module):
             encoder, dynamics, policy: networks, which stay as they are; TensorDictModules are unwrapped.
             barrier: a Lipschitz barrier of this library.
             level: {B <= level} becomes {B <= 0}.
+            gain: K of the latent observer.
             description: whatever should travel with the agent.
 
         Source: none.
@@ -119,7 +136,7 @@ class Agent(nn.Module):
         networks: dict[str, Any] = {k: _describe(net, latent_dim) for k, net in named.items()}
         body = {**(description or {}), "networks": networks | {"barrier": {"latent_dim": latent_dim, "hidden": hidden}}}
         body["lipschitz"] = {"proved": proof.proved, "reason": proof.reason, "multipliers": witness}
-        return cls(nets[0], nets[1], deployed, nets[3], bound, body)
+        return cls(nets[0], nets[1], deployed, nets[3], bound, body, gain)
 
     @classmethod
     def from_loss(cls, loss: Any, *, level: float = 0.0, description: dict[str, Any] | None = None) -> Agent:
@@ -137,6 +154,20 @@ class Agent(nn.Module):
         """Action ``(*batch, m)`` in physical units and barrier value ``(*batch, 1)``; pixels as for :meth:`encode`."""
         latent = self.encode(pixels)
         return self.policy(latent), self.barrier(latent)
+
+    def controller(self, batch_size: int = 1) -> Controller:
+        """What runs on n systems side by side: with a memory of its own, and the premise of the proof watched.
+
+        Example:
+            >>> load("pendulum").controller(batch_size=3).batch_size
+            3
+        """
+        return Controller(self, batch_size)
+
+    @property
+    def tolerated_error(self) -> float:
+        """Error per step, latent units, up to which the proof applies at run time; 0 where nothing is proved."""
+        return float(self.description.get("tolerated_error", 0.0))
 
     @property
     def latent_dim(self) -> int:
@@ -188,7 +219,9 @@ class Agent(nn.Module):
             agent = cls(
                 encoder, dynamics, mlp_barrier(**nets["barrier"]), _build(POLICIES, nets["policy"]), bound, body
             )
-            agent.load_state_dict(load_file(path / WEIGHTS_FILE))
+            weights = load_file(path / WEIGHTS_FILE)
+            agent.load_state_dict({"gain": agent.gain} | weights)  # without one, it has no observer
+            gain_matrix(agent.gain, agent.latent_dim)
         except CheckpointError:
             raise
         except (ValueError, KeyError, TypeError, AttributeError, RuntimeError, OSError, SafetensorError) as error:
@@ -231,7 +264,8 @@ def hosted(agent: Agent) -> Agent:
     if device.type == "cpu":
         return agent
     dynamics, barrier, policy = (copy.deepcopy(net).cpu() for net in (agent.dynamics, agent.barrier, agent.policy))
-    return Agent(_Elsewhere(agent.encoder, device), dynamics, barrier, policy, agent.lipschitz_bound, agent.description)
+    encoder, gain = _Elsewhere(agent.encoder, device), agent.gain.cpu()
+    return Agent(encoder, dynamics, barrier, policy, agent.lipschitz_bound, agent.description, gain)
 
 
 def build_encoder(name: str, **sizes: Any) -> nn.Module:

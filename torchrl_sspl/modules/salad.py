@@ -128,7 +128,8 @@ def make_rollout_policy(encoder: nn.Module, policy: nn.Module) -> TensorDictSequ
     What is no module is a ConfigError. Source: none.
 
     Args:
-        encoder: observation -> latent, or the :class:`SaLaD` that holds it.
+        encoder: observation -> latent, or the :class:`SaLaD` that holds it; with a
+            :class:`~torchrl_sspl.modules.LatentObserver` put :class:`~torchrl_sspl.modules.Predict` behind the policy.
         policy: latent -> action.
 
     Example:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from torchrl_sspl.objectives.action_value import ActionValueLoss
 from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
 from torchrl_sspl.objectives.consistency import ConsistencyLoss
+from torchrl_sspl.objectives.counterexample import CounterexampleLoss
 from torchrl_sspl.objectives.deviation import PolicyDeviationLoss
 from torchrl_sspl.objectives.lipschitz import LipschitzLoss
 from torchrl_sspl.objectives.salad import SaLaDLoss
@@ -16,6 +17,7 @@ __all__ = [
     "ActionValueLoss",
     "PRESETS",
     "ConsistencyLoss",
+    "CounterexampleLoss",
     "LatentBatch",
     "LatentLoss",
     "LipschitzLoss",

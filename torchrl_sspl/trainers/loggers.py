@@ -71,6 +71,8 @@ METRICS: Mapping[str, str] = MappingProxyType(
         "touched": "held-out episodes that touched U (a number)",
         "returned": "share of held-out episodes from U that ended inside",
         "size": "share of held-out unlabelled observations with B <= 0",
+        "tolerated": "error per step that the set is proved to tolerate (latent units; 0 where that was not asked for)",
+        "covered": "share of held-out episodes to which the proof applies",
         "passed": "1 if the round passed its checks",
         # Evaluation of a frozen agent on fresh episodes of an environment without a known model.
         "eval_unsafe_called_safe": "share of fresh episodes with an observation of U at B <= 0",

@@ -22,6 +22,7 @@ from tqdm import tqdm
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.observer import filtered, gain_matrix
 from torchrl_sspl.trainers.loggers import METRICS, log_scalars
 from torchrl_sspl.trainers.source import Source
 
@@ -132,6 +133,8 @@ class Check:
     size: float  # share of the unlabelled observations inside the set
     passed: bool  # whether the set may be returned
     reason: str  # why not
+    tolerated: float = 0.0  # error that the set is proved to tolerate, latent units; 0 where that was not asked for
+    covered: float = 0.0  # share of the episodes to which the proof applies from the first to the last step
 
 
 class Workspace:
@@ -176,6 +179,7 @@ class Workspace:
         self.logger: Any = None  # of TorchRL
         self.logged_step = 0
         self.where: dict[str, Any] = {"phase": "", "round": 0}
+        self.gain = gain_matrix(self.config.gain, self.latent_dim)
         self.latents: dict[str, Tensor] = {}
         self.counterexamples = torch.zeros(0, self.latent_dim)
         self.taught: nn.Module | None = None
@@ -227,10 +231,26 @@ class Workspace:
         """``(n,)`` whether a transition starts in U."""
         return self.latents["region"][:, 0] == 2
 
+    @property
+    def observing(self) -> bool:
+        """Whether the latent observer has a memory."""
+        return not torch.equal(self.gain, torch.eye(self.latent_dim))
+
+    def filtered(self, part: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Transitions of a source, with what the observer makes of them by the present dynamics."""
+        args = (part[k] for k in ("seen", "next_seen", "action", "continues"))
+        latent, after = filtered(self.dynamics, self.gain, *args) if self.observing else (part["seen"], part["next_seen"])
+        return part | {"latent": latent, "next_latent": after}
+
     def agent(self, level: float | None = None) -> Agent:
         """A frozen copy of the present networks; {B <= level} becomes {B <= 0}."""
-        level = self.level if level is None else level
-        return Agent.from_networks(self.encoder, *self.networks.values(), level=level, description=self.description)
+        level, nets = self.level if level is None else level, self.networks.values()
+        return Agent.from_networks(self.encoder, *nets, level=level, gain=self.running_gain, description=self.description)
+
+    @property
+    def running_gain(self) -> Tensor:
+        """Gain with which the agent runs."""
+        return self.gain if not self.observing else self.config.gain_share * self.gain
 
     def keep(self, rank: Any, number: int, level: float) -> None:
         """Remember the present networks as the best so far."""

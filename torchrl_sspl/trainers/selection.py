@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from torchrl_sspl.evaluation.certify import premise
 from torchrl_sspl.evaluation.controllers import AgentController, RandomController
 from torchrl_sspl.evaluation.episodes import separating_level
 from torchrl_sspl.evaluation.known import encode_states
@@ -21,6 +23,7 @@ _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out che
 _LOWEST_LEVEL = -0.2
 _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away from what the set tolerates
 _UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
+_STEP, _LOWER = 4, 3  # levels between two of the lower ones for which a proof is tried, and how many of these
 _BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
 
 
@@ -33,6 +36,8 @@ class _HeldOut:
     anywhere: Tensor
     episodes: Episodes
     back: Episodes
+    drift: Tensor  # (n,) norm of the mean innovation of an episode
+    largest_innovation: float  # of single steps under random actions
 
 
 class CheckRound(Phase):
@@ -40,8 +45,11 @@ class CheckRound(Phase):
 
     The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations
     of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim,
-    in the first steps, so many short episodes say more than few long ones. Source: none; the paper stops at a total
-    loss of zero.
+    in the first steps, so many short episodes say more than few long ones. Then the weights say which error the set
+    tolerates (branch and bound), and so to how many of these episodes the proof applies; where they are few, lower
+    levels are tried, too. An observer that believes itself more than what it sees keeps a constant innovation; a set is
+    refused where the mean innovation of an episode is larger than single ones under random actions ever are.
+    Source: none; the paper stops at a total loss of zero.
     """
 
     name = "check"
@@ -57,12 +65,34 @@ class CheckRound(Phase):
             lowest = -_MOST_OF_MARGIN * work.config.margin - 1e-6  # below it the condition says nothing of the level
             checks = (self._check(work, held_out, level) for level in levels if level >= lowest)
             found = next((c for c in checks if c.passed), None) or self._check(work, held_out, 0.0)
+            if found.passed and work.config.cover_share > 0:
+                found = self._proved(work, held_out, found, [v for v in levels if lowest <= v < found.level])
         work.checks.append(found)
         work.log({"step": self.number, **{k: v for k, v in vars(found).items() if not isinstance(v, str)}})
         # Of the sets that passed, one into which starts in U return counts first, then the largest.
-        rank = [float(found.returned >= work.config.return_share), found.size]
+        sound = found.covered >= work.config.cover_share
+        rank = [float(sound), float(found.returned >= work.config.return_share), found.size]
         if found.passed and (work.best is None or rank >= list(work.best["rank"])):
             work.keep(rank, self.number, found.level)
+
+    def _proved(self, work: Workspace, held_out: _HeldOut, first: Check, lower: list[float]) -> Check:
+        """The largest set to whose episodes the proof applies, among what passed and a few lower levels; or the first."""
+        candidates = [first, *(self._check(work, held_out, level) for level in lower[_STEP - 1 :: _STEP][:_LOWER])]
+        for check in candidates:
+            if not check.passed:
+                continue
+            check.tolerated = premise(work.agent(check.level))
+            check.covered = self._covered(held_out.episodes, check)
+            if check.covered >= work.config.cover_share:
+                return check
+        return max((c for c in candidates if c.passed), key=lambda c: c.covered)
+
+    @staticmethod
+    def _covered(run: Episodes, check: Check) -> float:
+        """Share of the episodes from the set that meet the premise of the proof at every step."""
+        inside = run.seen[0] <= check.level
+        met = (run.prediction_error <= check.tolerated).all(0) & (run.seen <= check.level).all(0)
+        return float(met[inside].float().mean()) if check.tolerated > 0 and bool(inside.any()) else 0.0
 
     def _held_out(self, work: Workspace, agent: Agent) -> _HeldOut | None:
         s, source = work.config, work.source
@@ -82,7 +112,12 @@ class CheckRound(Phase):
         episodes = simulate(agent, env, start=start, horizon=s.check_horizon)
         back_from = env.sample_states(min(max(1, n // 4), _BACK[0]), generator, region=env.unsafe_set)
         back = simulate(agent, env, start=back_from, horizon=max(2 * s.check_horizon, _BACK[1]))
-        return _HeldOut(unsafe, safe, anywhere, episodes, back)
+        drift, largest = episodes.innovation[1:].mean(0).norm(dim=-1), math.inf
+        if work.observing:
+            chance = AgentController(agent, driver=RandomController.within(env, spawn(work.seed, "checks", 1000 + self.number)))
+            at_random = simulate(chance, env, start=start[: max(1, n // 10)], horizon=s.check_horizon)
+            largest = float(at_random.innovation.norm(dim=-1).max())
+        return _HeldOut(unsafe, safe, anywhere, episodes, back, drift, largest)
 
     def _check(self, work: Workspace, held_out: _HeldOut, level: float) -> Check:
         s, run, back = work.config, held_out.episodes, held_out.back
@@ -98,6 +133,9 @@ class CheckRound(Phase):
         tolerated = s.leave_share * int(inside.sum())
         counts = (("unsafe inside", bad, 0), ("safe outside", out, 0), ("left", left, tolerated), ("touched U", touched, 0))
         faults = [f"{name} {found}" for name, found, most in counts if found > most]
+        drift = held_out.drift[inside]
+        if bool((drift > held_out.largest_innovation).any()):
+            faults.append(f"innovations with a mean of up to {float(drift.max()):.2g}")
         passed = not faults and size > 0
         return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults))
 

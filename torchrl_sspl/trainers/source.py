@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import Any
 
 import torch
+from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy
+from torchrl_sspl.data.store import continues
 from torchrl_sspl.envs.base import SafetyEnv
-from torchrl_sspl.modules import make_rollout_policy
+from torchrl_sspl.modules import LatentObserver, Predict
+from torchrl_sspl.modules.salad import make_rollout_policy
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Mixture, Region
 
 _CHUNK = 4096  # transitions whose pictures are held at a time
+_LONGER = 3  # times as long as random ones are the episodes of a policy with memory
 _ENCODED = 1000  # and that are encoded at a time
 
 Latents = dict[str, Tensor]
@@ -109,7 +114,7 @@ class Source:
         if n > most:
             mixed = torch.randperm(n, generator=torch.Generator().manual_seed(self.seed))
             first = mixed[self.store.region[mixed] != UNLABELLED][: most // 2]
-            index = torch.cat([first, mixed[~torch.isin(mixed, first)][: most - len(first)]])
+            index = torch.cat([first, mixed[~torch.isin(mixed, first)][: most - len(first)]]).sort().values
         return self._encode(self.store, index)
 
     def random(self, n: int, index: int, *, region: Region | None = None, steps: int | None = None) -> Latents:
@@ -127,12 +132,32 @@ class Source:
 
         return self._in_chunks(draw, n, index)
 
-    def under(self, policy: nn.Module, n: int, index: int, *, exploration: float, region: Region | None = None) -> Latents:
-        """Latents of n transitions under a policy with noise on its actions; other arguments as for :meth:`random`."""
+    def under(
+        self,
+        policy: nn.Module,
+        n: int,
+        index: int,
+        *,
+        exploration: float,
+        region: Region | None = None,
+        dynamics: nn.Module | None = None,
+        gain: Tensor | None = None,
+    ) -> Latents:
+        """Latents of n transitions under a policy with noise on its actions; other arguments as for :meth:`random`.
+
+        With ``dynamics`` and ``gain`` the policy acts behind the latent observer.
+        """
         device = next(self.encoder.parameters()).device
-        acting = make_rollout_policy(self.encoder, policy.to(device))
+        # A memory that drifts shows only after many times its own length.
+        steps = self.steps if gain is None or self.steps is None else _LONGER * self.steps
+        acting, predict = make_rollout_policy(self.encoder, policy.to(device)), None
+        if gain is not None and dynamics is not None:
+            observer, decide = LatentObserver(self.encoder, gain, len(gain)).to(device), acting.module[-1]
+            acting = TensorDictSequential(observer, decide, selected_out_keys=["latent", "action"])
+            predict = Predict(copy.deepcopy(dynamics).to(device))
         space = self.env.action_spec_unbatched.space
-        exploring = ExploringPolicy(acting, space.low.cpu().float(), space.high.cpu().float(), exploration, 0.0).to(device)
+        bounds = space.low.cpu().float(), space.high.cpu().float()
+        exploring = ExploringPolicy(acting, *bounds, exploration, 0.0, predict).to(device)
 
         def draw(env: EnvBase, size: int, seed: int) -> TransitionStore:
             devices: dict[str, Any] = {}
@@ -140,16 +165,18 @@ class Source:
                 devices = {"policy_device": device, "env_device": "cpu", "storing_device": "cpu"}
             with torch.random.fork_rng():
                 torch.manual_seed(seed)
-                return collect_rollouts(env, exploring, size, seed=seed, steps=self.steps, region=region, **devices)
+                return collect_rollouts(env, exploring, size, seed=seed, steps=steps, region=region, **devices)
 
         try:
-            return self._in_chunks(draw, n, index)
+            return self._in_chunks(draw, n, index, envs=max(1, _CHUNK // (steps or 1)))
         finally:
             policy.cpu()
 
-    def _in_chunks(self, draw: Callable[[EnvBase, int, int], TransitionStore], n: int, index: int) -> Latents:
-        env = self.make_env(batch_size=[min(self.envs, n)], seed=self.seed)
-        parts = []
+    def _in_chunks(
+        self, draw: Callable[[EnvBase, int, int], TransitionStore], n: int, index: int, envs: int = _CHUNK
+    ) -> Latents:
+        env = self.make_env(batch_size=[min(self.envs, n, envs)], seed=self.seed)
+        parts = list[Latents]()
         for k, size in enumerate(c.numel() for c in torch.arange(n).split(_CHUNK)):
             store = draw(env, size, spawn(self.seed, "rounds", 1000 * index + k))
             store.pixel_views = not hasattr(self.encoder, "sequence")
@@ -161,7 +188,8 @@ class Source:
 
     @torch.no_grad()
     def _encode(self, store: TransitionStore, index: Tensor) -> Latents:
-        """Latents before and after, actions and regions of some transitions, on the CPU."""
+        """Encoded observations before and after, actions and regions of some transitions, on the CPU; which of them go on
+        where the one before ends."""
         device = next(self.encoder.parameters()).device
         parts = []
         for rows in index.split(_ENCODED):
@@ -171,8 +199,10 @@ class Source:
             else:
                 latent, after = self.encoder(batch["pixels"].to(device)), self.encoder(batch["next", "pixels"].to(device))
             parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"]))
-        names = ("latent", "next_latent", "action", "region")
-        return {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
+        names = ("seen", "next_seen", "action", "region")
+        found = {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
+        neighbours = torch.cat([torch.zeros(1, dtype=torch.bool), index[1:] == index[:-1] + 1])
+        return found | {"continues": continues(store, index) & neighbours}
 
 
 __all__ = ["Source", "TrainingStarts", "starts_of"]

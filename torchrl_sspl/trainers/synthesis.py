@@ -21,8 +21,10 @@ from torch import Tensor, nn
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, SynthesisLoss, TargetLoss
+from torchrl_sspl.modules.observer import corrected
+from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.base import LatentBatch
+from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.phases import Phase, Workspace
 from torchrl_sspl.viability.cloud import (
@@ -43,6 +45,12 @@ _SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerate
 _KEPT_OF_SAFE = 0.9
 _MOST_ACTIONS = 729  # in the grid that is tried at every latent
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
+_ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data tolerates
+_SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
+_MARGIN = 2.6  # of the condition on the data while counterexamples are worked off, per error that is to be tolerated
+_WEIGHT = 2.0  # of counterexamples
+_POOL = 8192  # counterexamples that are kept
+_UNROLLED = 12  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
 
@@ -63,7 +71,7 @@ class Gather(Phase):
             return  # they were given
         if self.number == 0:
             stored = source.stored(s.transitions)
-            missing = s.transitions - (0 if stored is None else len(stored["latent"]))
+            missing = s.transitions - (0 if stored is None else len(stored["seen"]))
             parts = [] if stored is None else [stored]
             if missing > 0 and (source.known or stored is None):
                 parts.append(source.random(missing, 0))
@@ -71,6 +79,7 @@ class Gather(Phase):
             parts = [work.latents, self._near_the_set(work)]
             if source.known and s.rim_transitions:
                 parts.append(self._rim(work))
+        parts = [work.filtered(part) for part in parts]
         work.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
         work.cache.clear()
         unsafe = work.unsafe()
@@ -84,14 +93,17 @@ class Gather(Phase):
     def _near_the_set(self, work: Workspace) -> dict[str, Tensor]:
         s, source = work.config, work.source
         region = source.outside_unsafe if source.known else None
+        memory: dict[str, Any] = {"dynamics": work.dynamics, "gain": work.gain} if work.observing else {}
         found: list[dict[str, Tensor]] = []
         count = 0
         for attempt in range(10):
             part = source.under(
-                work.policy, s.rollout_transitions, 20 * self.number + attempt, exploration=s.exploration, region=region
+                work.policy, s.rollout_transitions, 20 * self.number + attempt, exploration=s.exploration, region=region, **memory
             )
             with torch.no_grad():
-                near = work.barrier(part["latent"])[:, 0] < _NEAR
+                near = work.barrier(work.filtered(part)["latent"])[:, 0] < _NEAR
+            # What goes on after a transition that is left out would begin a new episode there.
+            part["continues"] &= torch.cat([near[:1], near[:-1]])
             found.append({k: v[near] for k, v in part.items()})
             count += int(near.sum())
             if count >= s.rollout_transitions or not source.known:
@@ -102,7 +114,7 @@ class Gather(Phase):
     def _rim(self, work: Workspace) -> dict[str, Tensor]:
         s, source = work.config, work.source
         drawn = source.random(s.rim_draws * s.rim_transitions, 20 * self.number + 10, region=source.env.unsafe_set, steps=1)
-        lowest = work.barrier(drawn["latent"])[:, 0].topk(s.rim_transitions, largest=False).indices
+        lowest = work.barrier(drawn["seen"])[:, 0].topk(s.rim_transitions, largest=False).indices
         return {k: v[lowest] for k, v in drawn.items()}
 
 
@@ -117,8 +129,10 @@ class _Training(Phase):
 
 
 class FitDynamics(_Training):
-    """Dynamics on frozen latents; off the manifold they lead back to it.
+    """Dynamics on frozen latents, through the observer where it has a memory; off the manifold they lead back to it.
 
+    One step ahead is not enough behind an observer: a bias b that no single step shows becomes an offset b / k of its
+    latent. What is unrolled are pieces of episodes, from the latents of the last filtering.
     Source: paper eq. (8), third term; deviation: the worst errors count extra, so do latents off the manifold.
     """
 
@@ -127,19 +141,42 @@ class FitDynamics(_Training):
     def run(self, work: Workspace) -> None:
         s, data = work.config, work.latents
         tube, base = off_manifold(work, data["latent"], 1.3 * s.tube_radius, self.number)
-        on, off = 2 * s.batch // 6, s.batch // 6
+        on, off = (2 * s.batch // 6, s.batch // 6) if not work.observing else (s.batch // 4, s.batch)
         loss = ConsistencyLoss(work.dynamics, unsafe_weight=s.unsafe_weight, worst_coeff=0.2, worst_fraction=0.05)
 
         latent, after, action, region = (data[k] for k in ("latent", "next_latent", "action", "region"))
+        pieces = _pieces(data["continues"]) if work.observing else None
 
         def step() -> dict[str, Tensor]:
-            a, c = work.loop.pick(len(latent), on), work.loop.pick(len(tube), off) if len(tube) else None
-            z, index = latent[a], a
+            a, c = work.loop.pick(len(latent if pieces is None else pieces), on), None
+            if len(tube):
+                c = work.loop.pick(len(tube), off)
+            z, index, target = latent[a], a, after[a]
+            if pieces is not None:
+                z, index = self._unrolled(work, pieces[a])
+                target = data["next_seen"][index]
             if c is not None:
-                z, index = torch.cat([z, tube[c]]), torch.cat([a, base[c]])
-            return loss.terms(LatentBatch(z, next_latent=after[index], action=action[index], region=region[index]))
+                z, index, target = torch.cat([z, tube[c]]), torch.cat([index, base[c]]), torch.cat([target, after[base[c]]])
+            return loss.terms(LatentBatch(z, next_latent=target, action=action[index], region=region[index]))
 
-        work.loop(self.size(work), {work.dynamics: 3e-3 if self.number == 0 else 2e-3}, step)
+        rate = 1e-3 if work.observing else 3e-3 if self.number == 0 else 2e-3
+        work.loop(self.size(work), {work.dynamics: rate}, step)
+        work.latents = work.filtered(work.latents)
+        work.cache.clear()
+
+    @staticmethod
+    def _unrolled(work: Workspace, rows: Tensor) -> tuple[Tensor, Tensor]:
+        """Latents along pieces of episodes ``(n, k)``, with their gradient, and which transitions these are."""
+        data, z = work.latents, []
+        latent = data["latent"][rows[:, 0]]
+        for k in range(rows.shape[1]):
+            here = rows[:, k]
+            z.append(latent)
+            if k + 1 < rows.shape[1]:
+                latent = corrected(work.dynamics(latent, data["action"][here]), data["next_seen"][here], work.gain)[0]
+        index = rows.mT.flatten()
+        kept = index >= 0
+        return torch.cat(z)[kept], index[kept]
 
 
 class TeachPolicy(_Training):
@@ -223,14 +260,21 @@ class FineTune(_Training):
             drawn += [rows[pick(len(rows), n)] for rows, n in shares if len(rows)]
             asked = rim[pick(len(rim), 3 * s.batch // 2)]
             error = asked["residual"][torch.arange(len(asked)), pick(s.residuals, len(asked))]
+            if s.tolerated_error > 0:  # the margin stands for all errors
+                error = torch.zeros_like(error)
             asked = asked.exclude("residual").set("residual", error)
             if s.counterexamples:
                 asked = self._with_counterexamples(work, asked)
             terms = condition(asked)
             terms.update(target(table[torch.cat(drawn)]))
+            terms.update(self.more(work, rim["latent"]))
             return terms
 
         work.loop(self.size(work), self.rates(work), step)
+
+    def more(self, work: Workspace, rim: Tensor) -> dict[str, Tensor]:
+        """Further terms of a step."""
+        return {}
 
     def _losses(self, work: Workspace) -> tuple[SynthesisLoss, TargetLoss]:
         s = work.config
@@ -273,6 +317,59 @@ class SteerPolicy(FineTune):
         return 2 * config.margin
 
 
+class Tighten(FineTune):
+    """Counterexamples of the proof go back into the fine-tuning until there are few left.
+
+    They are looked for near the data, in the whole domain and around those found before, anew every hundred steps.
+    Source: none (counterexample-guided synthesis); the paper asks the condition of its samples alone.
+    """
+
+    name = "tighten"
+
+    def rates(self, work: Workspace) -> dict[nn.Module, float]:
+        return {work.barrier: 0.5 * work.config.lr, work.policy: 0.5 * work.config.lr}
+
+    def margin(self, config: SynthesisConfig) -> float:
+        return max(config.margin, _MARGIN * config.tolerated_error)
+
+    def run(self, work: Workspace) -> None:
+        if work.loop.step == 0:
+            work.counterexamples = torch.zeros(0, work.latent_dim)
+        self._loss = CounterexampleLoss(
+            work.dynamics, work.barrier, work.policy, dynamics_margin=_SPARE, error=work.config.tolerated_error,
+            worst_coeff=0.3, worst_fraction=0.02,
+        )  # fmt: skip
+        super().run(work)
+
+    def more(self, work: Workspace, rim: Tensor) -> dict[str, Tensor]:
+        if work.loop.step % 100 == 0:
+            work.counterexamples = self._search(work, rim)
+        if not len(work.counterexamples):
+            return {}
+        rows = work.counterexamples[work.loop.pick(len(work.counterexamples), work.config.batch)]
+        terms = self._loss(TensorDict(latent=rows, batch_size=[len(rows)]))
+        return {k: _WEIGHT * v if k.startswith("loss") else v for k, v in terms.items()}
+
+    @torch.no_grad()
+    def _search(self, work: Workspace, rim: Tensor, samples: int = 60_000) -> Tensor:
+        """The worst latents of the set, up to as many as are kept; those that are nearly counterexamples count, too."""
+        g, p, old = work.loop.generator, work.latent_dim, work.counterexamples
+        near = rim[work.loop.pick(len(rim), samples)] + 0.04 * torch.randn(samples, p, generator=g)
+        points = [near, torch.rand(samples, p, generator=g) * 2 - 1]
+        if len(old):
+            points += [old, old[work.loop.pick(len(old), samples // 2)] + 0.01 * torch.randn(samples // 2, p, generator=g)]
+        z = torch.cat(points).clamp(-1, 1)
+        z = z[work.barrier(z)[:, 0] <= 0.02]
+        if not len(z):
+            return z
+        after, error = work.dynamics(z, work.policy(z)), work.config.tolerated_error
+        possible = work.barrier(after)[:, 0] + work.lipschitz_bound * error + _SPARE > -0.01
+        z, after = z[possible], after[possible]
+        value = work.barrier(after + worst_error(work.barrier, after, error))[:, 0] + _SPARE
+        worst = value.topk(min(_POOL, len(value)))
+        return z[worst.indices[worst.values > -0.01]]
+
+
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
     """The phases of every round.
 
@@ -287,8 +384,19 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
         ['gather', 'dynamics', 'teach', 'fit', 'steer', 'tune']
     """
     teach = [TeachPolicy] if config.teacher == "value" else []
-    kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, SteerPolicy, FineTune, *([check] if check else [])]
+    tighten = [Tighten] if config.tolerated_error > 0 else []
+    kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, SteerPolicy, FineTune, *tighten, *([check] if check else [])]
     return [kind(k) for k in range(config.rounds) for kind in kinds]
+
+
+def _pieces(continues: Tensor) -> Tensor:
+    """Rows ``(n, k)`` of pieces of episodes of at most so many transitions, filled up with -1 behind their end."""
+    rows = torch.arange(len(continues))
+    begins = torch.where(continues, 0, rows).cummax(0).values
+    first = rows[(rows - begins) % _UNROLLED == 0]
+    piece = first[:, None] + torch.arange(_UNROLLED)
+    ends = torch.cat([first[1:], torch.tensor([len(continues)])])
+    return torch.where(piece < ends[:, None], piece, -1)
 
 
 def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
@@ -335,7 +443,13 @@ def observed_errors(work: Workspace, latent: Tensor, generator: torch.Generator,
     with torch.no_grad():
         residual = data["next_latent"] - work.dynamics(z, data["action"])
     sample = torch.randperm(len(z), generator=generator)[:30000]
-    return nearby_residuals(latent, z[sample], residual[sample], count=work.config.residuals, spread=spread)
+    near, axes = nearby_residuals(latent, z[sample], residual[sample], count=work.config.residuals, spread=spread)
+    if work.config.tolerated_error > 0:
+        # The direction is what was observed, the length what is to be tolerated, and room for what a network does not fit.
+        mean, ends = axes[:, :1], axes[:, 1:] - axes[:, :1]
+        length = _ROOM * work.config.tolerated_error / ends.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        axes = torch.cat([mean, mean + length * ends], dim=1)
+    return near, axes
 
 
 @torch.no_grad()
@@ -435,4 +549,6 @@ def _value_targets(work: Workspace, queries: Tensor, errors: Tensor) -> tuple[Te
     return target, target <= 0, action, torch.ones(len(z))
 
 
-__all__ = ["FineTune", "FitDynamics", "FitSets", "Gather", "SteerPolicy", "TeachPolicy", "action_grid", "synthesis_phases"]
+__all__ = [
+    "FineTune", "FitDynamics", "FitSets", "Gather", "SteerPolicy", "TeachPolicy", "Tighten", "action_grid", "synthesis_phases",
+]

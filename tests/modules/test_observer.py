@@ -1,0 +1,218 @@
+"""The latent observer: its arithmetic, its memory in collectors, and the controller that watches the proof's premise."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.collectors import Collector
+from torchrl.envs import TransformedEnv
+from torchrl.modules.utils import get_env_transforms_from_module
+
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.evaluation.controllers import AgentController
+from torchrl_sspl.evaluation.simulation import simulate
+from torchrl_sspl.modules import FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
+from torchrl_sspl.modules.agent import Agent, load, mlp_barrier
+from torchrl_sspl.modules.observer import corrected, filtered, gain_matrix
+
+
+def small_agent(gain: float | Tensor = 0.2, error: float = 0.05) -> Agent:
+    torch.manual_seed(0)
+    nets = FrameEncoder(3, 16, pool_to=8), LatentDynamics(3, 1, (8,), 10.0), mlp_barrier(3, [8]), Policy(3, 1, (8,), 10.0)
+    return Agent(*nets, 2.0, {"tolerated_error": error}, gain)
+
+
+def frames(n: int, seed: int = 0) -> Tensor:
+    return torch.randint(256, (n, 6, 16, 16), dtype=torch.uint8, generator=torch.Generator().manual_seed(seed))
+
+
+@pytest.mark.parametrize(
+    "gain", [0.0, -0.1, 2.1, math.nan, math.inf, torch.eye(2), torch.zeros(3, 3), 3.0 * torch.eye(3), torch.full((3, 3), math.nan)]
+)
+def test_gains_that_are_none_are_refused(gain):
+    with pytest.raises(ConfigError, match="gain"):
+        gain_matrix(gain, 3)
+
+
+def test_gain_one_is_what_is_seen_to_the_last_bit():
+    prior, seen = torch.randn(2, 100, 3).tanh()
+    assert torch.equal(corrected(prior, seen, torch.eye(3))[0], seen)
+
+
+def test_the_posterior_lies_between_prior_and_observation():
+    prior, seen = torch.randn(2, 100, 3).tanh()
+    latent, innovation = corrected(prior, seen, gain_matrix(0.25, 3))
+    assert torch.allclose(latent, 0.75 * prior + 0.25 * seen, atol=1e-6)
+    assert torch.allclose(innovation, seen - prior)
+    beyond, _ = corrected(torch.full((1, 3), -3.0), torch.full((1, 3), -3.0), torch.eye(3))
+    assert torch.equal(beyond, -torch.ones(1, 3))
+
+
+def test_a_matrix_corrects_each_direction_by_its_own_share():
+    gain = torch.tensor([[0.5, 0.1], [0.0, 1.0]])
+    latent, _ = corrected(torch.zeros(1, 2), torch.tensor([[0.2, 0.4]]), gain)
+    assert torch.allclose(latent, torch.tensor([[0.5 * 0.2 + 0.1 * 0.4, 0.4]]))
+
+
+def test_recorded_episodes_are_filtered_as_a_loop_filters_them():
+    torch.manual_seed(1)
+    dynamics, gain = LatentDynamics(3, 1, (8,), 10.0), gain_matrix(0.3, 3)
+    lengths = (1, 4, 2, 7)
+    seen, after, action, continues, expected = [], [], [], [], []
+    for n in lengths:
+        z, u = torch.randn(n + 1, 3).tanh(), torch.randn(n, 1)
+        seen.append(z[:-1]), after.append(z[1:]), action.append(u)
+        continues.append(torch.arange(n) > 0)
+        latent = z[0]
+        for k in range(n):
+            follow = corrected(dynamics(latent[None], u[k : k + 1]), z[k + 1 : k + 2], gain)[0][0]
+            expected.append((latent, follow))
+            latent = follow
+    found = filtered(dynamics, gain, *(torch.cat(v) for v in (seen, after, action, continues)))
+    for k in (0, 1):
+        assert torch.allclose(found[k], torch.stack([e[k] for e in expected]), atol=1e-6)
+
+
+@pytest.mark.filterwarnings("ignore:Nested TransformedEnvs")
+def test_collectors_carry_the_memory_and_forget_it_at_resets():
+    agent = small_agent()
+    policy = TensorDictSequential(
+        LatentObserver(agent.encoder, 0.2, 3), TensorDictModule(agent.policy, ["latent"], ["action"]), Predict(agent.dynamics)
+    )
+    env = PendulumEnv(batch_size=[4], image_size=16, seed=0)
+    collector = Collector(env, policy, frames_per_batch=48, total_frames=48, max_frames_per_traj=5, auto_register_policy_transforms=True)
+    data = next(iter(collector))
+    collector.shutdown()
+    begins, prior = data["is_init"][..., 0], data["prior"]
+    assert begins.sum() == 4 * 3
+    seen = agent.encode(data["pixels"])
+    latent, _ = corrected(torch.where(begins[..., None], seen, prior), seen, agent.gain)
+    assert torch.allclose(data["latent"], latent, atol=1e-6)
+    on = ~begins[:, 1:]
+    assert torch.equal(data["next", "prior"][:, :-1][on], prior[:, 1:][on])
+    assert torch.allclose(data["next", "prior"], agent.dynamics(data["latent"], data["action"]), atol=1e-6)
+
+
+def test_a_missing_primer_is_named():
+    observer = LatentObserver(FrameEncoder(3, 16, pool_to=8), 0.2, 3)
+    env = PendulumEnv(batch_size=[2], image_size=16, seed=0)
+    data = TransformedEnv(env, get_env_transforms_from_module(observer)).reset()
+    assert observer(data)["latent"].shape == (2, 3)
+    with pytest.raises(ShapeError, match="primer"):
+        observer(data.set("prior", torch.zeros(2, 4)))
+
+
+def test_the_controller_is_the_closed_loop_that_is_measured():
+    agent, env = small_agent(), PendulumEnv(batch_size=[3], image_size=16, seed=0)
+    start = env.sample_states(3)
+    run = simulate(AgentController(agent), env, start=start, horizon=6)
+    controller, before = agent.controller(3), env.previous_state(start)
+    for t in range(6):
+        out = controller.step(env.observe(run.states[t], before))
+        assert torch.allclose(out.action, run.actions[t], atol=1e-5)
+        assert torch.allclose(out.barrier, run.barrier[t], atol=1e-5)
+        assert torch.equal(out.inside, out.barrier <= 0)
+        assert torch.allclose(out.innovation, run.innovation[t].norm(dim=-1), atol=1e-5)
+        if t:
+            assert torch.allclose(out.error, run.prediction_error[t - 1], atol=1e-5)
+        before = run.states[t]
+
+
+class Script(nn.Module):
+    """Shows given latents, one after the other."""
+
+    def __init__(self, latents: Tensor) -> None:
+        super().__init__()
+        self.latents, self.k = latents, -1
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        self.k += 1
+        return self.latents[self.k].expand(len(pixels), 1)
+
+
+class Still(LatentDynamics):
+    """Nothing moves."""
+
+    def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return latent
+
+
+def watched(latents: list[float], *, error: float = 0.11, gain: float = 0.5) -> list[bool]:
+    """Whether the proof applies, step by step, to what is seen; B(z) = z - 0.5."""
+    barrier = nn.Sequential(nn.Linear(1, 1))
+    with torch.no_grad():
+        barrier[0].weight.fill_(1.0)
+        barrier[0].bias.fill_(-0.5)
+    script = Script(torch.tensor(latents)[:, None])
+    agent = Agent(script, Still(1, 1), barrier, Policy(1, 1), 1.0, {"tolerated_error": error}, gain)
+    controller = agent.controller(1)
+    return [bool(controller.step(torch.zeros(1, 6, 8, 8, dtype=torch.uint8)).applies) for _ in latents]
+
+
+@pytest.mark.parametrize(
+    ("latents", "applies"),
+    [
+        ([0.0, 0.2, 0.3], [True, True, True]),
+        ([0.0, 0.3, 0.3], [True, False, False]),  # corrected by .15
+        ([0.6, 0.4], [False, False]),  # it began outside
+        ([0.4, 0.55, 0.4], [True, False, False]),  # looks like U, the correction is small
+        ([0.0, math.nan], [True, False]),
+        ([0.0] * 5, [True] * 5),
+    ],
+)
+def test_the_premise_is_watched_and_never_met_again_once_it_was_not(latents, applies):
+    assert watched(latents) == applies
+
+
+def test_where_nothing_is_proved_no_premise_is_met():
+    assert watched([0.0, 0.0], error=0.0) == [False, False]
+
+
+def test_resets_forget_some_or_all():
+    agent = small_agent()
+    controller = agent.controller(4)
+    first = controller.step(frames(4))
+    controller.step(frames(4, 1))
+    controller.reset(torch.tensor([1, 3]))
+    again = controller.step(frames(4))
+    for rows in ([1, 3], torch.tensor([False, True, False, True])):
+        assert torch.allclose(again.latent[rows], first.latent[rows], atol=1e-6)
+    assert not torch.allclose(again.latent[[0, 2]], first.latent[[0, 2]], atol=1e-6)
+    controller.reset()
+    assert torch.equal(controller.step(frames(4)).latent, first.latent)
+
+
+def test_wrong_batches_are_refused():
+    with pytest.raises(ConfigError, match="batch_size"):
+        small_agent().controller(0)
+    with pytest.raises(ShapeError, match="4 systems"):
+        small_agent().controller(4).step(frames(3))
+
+
+def test_the_gain_travels_with_the_agent(tmp_path):
+    shipped = load("pendulum")
+    changed = Agent(
+        shipped.encoder, shipped.dynamics, shipped.barrier, shipped.policy, shipped.lipschitz_bound, shipped.description, 0.37
+    )
+    assert torch.equal(Agent.load(changed.save(tmp_path / "agent")).gain, gain_matrix(0.37, shipped.latent_dim))
+
+
+@pytest.mark.parametrize("error", [-0.1, math.inf, math.nan, "0.1", True])
+def test_a_tolerated_error_that_is_none_is_refused(error):
+    with pytest.raises(ConfigError, match="tolerated error"):
+        small_agent(error=error)
+
+
+def test_an_agent_with_a_gain_that_is_none_cannot_be_read(tmp_path):
+    from safetensors.torch import load_file, save_file
+
+    path = load("pendulum").save(tmp_path / "agent")
+    weights = load_file(path / "agent.safetensors")
+    save_file(weights | {"gain": 3.0 * torch.eye(3)}, path / "agent.safetensors")
+    with pytest.raises(CheckpointError, match="gain"):
+        Agent.load(path)

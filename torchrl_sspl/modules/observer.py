@@ -1,0 +1,174 @@
+r"""The latent observer: a memory that believes its own prediction, and corrects it by a share of what is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor, nn
+from torchrl.data import Unbounded
+from torchrl.envs import TensorDictPrimer
+
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.modules.salad import as_tensordict_module
+
+
+def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int) -> Tensor:
+    """The gain K ``(p, p)`` of an observer, from a number k (K = k I) or a matrix. Source: none.
+
+    Args:
+        gain: k or K; 1 or the identity: what is seen is believed as it is.
+        latent_dim: p.
+
+    Raises:
+        ConfigError: if it has another shape, or is not finite, or I - K is longer than 1 in some direction (the observer
+            would move away from what it sees), or K is zero.
+
+    Example:
+        >>> gain_matrix(0.5, 2).tolist()
+        [[0.5, 0.0], [0.0, 0.5]]
+    """
+    given = torch.as_tensor(gain, dtype=torch.float32).detach().cpu()
+    matrix = given * torch.eye(latent_dim) if given.ndim == 0 else given.clone()
+    if matrix.shape != (latent_dim, latent_dim) or not bool(matrix.isfinite().all()):
+        raise ConfigError(
+            f"expected a gain that is a finite number or a ({latent_dim}, {latent_dim}) matrix, received {tuple(given.shape)}"
+        )
+    left = float(torch.linalg.matrix_norm(torch.eye(latent_dim) - matrix, ord=2))
+    if left > 1.0 + 1e-6 or not bool(matrix.any()):
+        raise ConfigError(
+            f"expected a gain K with |I - K| <= 1 that is not zero, such as a number in (0, 1], received |I - K| = {left:.3g}"
+        )
+    return matrix
+
+
+def corrected(prior: Tensor, seen: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
+    r"""Posterior and innovation of an observer.
+
+    .. math:: i_t = E(o_t) - p_t, \qquad \hat z_t = \operatorname{clamp}(p_t + K i_t, -1, 1)
+
+    Latents ``(*batch, p)``, gain ``(p, p)``. Source: none (the paper acts on :math:`E(o_t)`, which is K = I).
+
+    Example:
+        >>> corrected(torch.zeros(1, 1), torch.ones(1, 1), torch.tensor([[0.25]]))[0].tolist()
+        [[0.25]]
+    """
+    innovation = seen - prior
+    left = torch.eye(len(gain), dtype=gain.dtype, device=gain.device) - gain
+    # From what is seen, not from the prior: with K = I the result is what is seen, to the last bit.
+    return (seen - innovation @ left.mT).clamp(-1.0, 1.0), innovation
+
+
+class LatentObserver(TensorDictModuleBase):
+    r"""Encoder with a memory: the latent that was predicted, corrected by a share of what is seen.
+
+    .. math::
+        p_t = d(\hat z_{t-1}, u_{t-1}), \qquad i_t = E(o_t) - p_t, \qquad
+        \hat z_t = \operatorname{clamp}(p_t + K i_t, -1, 1), \qquad \hat z_0 = E(o_0)
+
+    An encoder of two frames sees a velocity badly: its error is as large as that of a disturbance at every step. Behind
+    an observer only :math:`K i_t` enters the closed loop, several times smaller. K = I is the encoder alone. The
+    prediction is a hidden state in TorchRL's way: it is read from ``"prior"``, forgotten where ``"is_init"``, and
+    written to ``("next", "prior")`` by :class:`Predict`, once the action is known. :meth:`make_tensordict_primer` gives
+    the transform of the environment that both keys need beside ``InitTracker``.
+
+    Args:
+        encoder: observation -> latent ``(*batch, p)`` in [-1, 1].
+        gain: K, a number or ``(p, p)``; see :func:`gain_matrix`, for errors too.
+        latent_dim: p.
+
+    Source: none (Luenberger's observer on a learned latent; in world models prior and posterior); the paper has K = I.
+
+    Example:
+        >>> from tensordict import TensorDict
+        >>> from torchrl_sspl.modules import FrameEncoder
+        >>> observer = LatentObserver(FrameEncoder(2), 0.2, 2)
+        >>> pixels = torch.zeros(4, 6, 32, 32, dtype=torch.uint8)
+        >>> begins = torch.zeros(4, 1, dtype=torch.bool)
+        >>> data = observer(TensorDict(pixels=pixels, prior=torch.zeros(4, 2), is_init=begins, batch_size=[4]))
+        >>> torch.allclose(data["latent"], 0.2 * data["innovation"])
+        True
+    """
+
+    gain: Tensor
+
+    def __init__(self, encoder: nn.Module, gain: float | Sequence[Any] | Tensor, latent_dim: int) -> None:
+        super().__init__()
+        self.encoder = as_tensordict_module(encoder, ["pixels"], ["latent"])
+        self.latent_dim = latent_dim
+        self.register_buffer("gain", gain_matrix(gain, latent_dim))
+        self.in_keys = [*self.encoder.in_keys, "prior", "is_init"]
+        self.out_keys = [*self.encoder.out_keys[:1], "innovation"]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write the latent and ``"innovation"``, both ``(*batch, p)``; where an episode begins there is none."""
+        seen = self.encoder(tensordict.select(*self.encoder.in_keys))[self.out_keys[0]]
+        prior, begins = tensordict["prior"], tensordict["is_init"]
+        if prior.shape != seen.shape:
+            raise ShapeError(f"expected a prior of shape {tuple(seen.shape)}, received {tuple(prior.shape)}; add the primer")
+        latent, innovation = corrected(torch.where(begins, seen, prior), seen, self.gain)
+        return tensordict.set(self.out_keys[0], latent).set("innovation", innovation)
+
+    def make_tensordict_primer(self) -> TensorDictPrimer:
+        """The transform that gives an environment the key ``"prior"``; TorchRL's collectors look for it."""
+        return TensorDictPrimer(prior=Unbounded((self.latent_dim,)), expand_specs=True)
+
+
+class Predict(TensorDictModuleBase):
+    """Writes the observer's next prior, ``("next", "prior")``, from latent and action. Source: none.
+
+    Args:
+        dynamics: (latent ``(*batch, p)``, action ``(*batch, m)``) -> next latent ``(*batch, p)``.
+
+    Example:
+        >>> from torchrl_sspl.modules import LatentDynamics
+        >>> Predict(LatentDynamics(2, 1)).out_keys
+        [('next', 'prior')]
+    """
+
+    def __init__(self, dynamics: nn.Module) -> None:
+        super().__init__()
+        self.dynamics = as_tensordict_module(dynamics, ["latent", "action"], [("next", "latent")])
+        self.in_keys, self.out_keys = list(self.dynamics.in_keys), [("next", "prior")]
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Write ``("next", "prior")`` ``(*batch, p)``."""
+        after = self.dynamics(tensordict.select(*self.in_keys))[self.dynamics.out_keys[0]]
+        return tensordict.set(("next", "prior"), after)
+
+
+@torch.no_grad()
+def filtered(
+    dynamics: nn.Module, gain: Tensor, seen: Tensor, next_seen: Tensor, action: Tensor, continues: Tensor
+) -> tuple[Tensor, Tensor]:
+    r"""What an observer makes of recorded episodes: latents before and after every transition, each ``(n, p)``.
+
+    Args:
+        dynamics: (latent, action) -> next latent.
+        gain: K ``(p, p)``.
+        seen, next_seen: encoded observations before and after ``(n, p)``.
+        action: ``(n, m)``.
+        continues: ``(n,)`` bool, whether a transition goes on where the one before it ends; others begin an episode.
+
+    Source: none.
+
+    Example:
+        >>> still = lambda latent, action: latent
+        >>> seen, after = torch.zeros(2, 1), torch.ones(2, 1)
+        >>> filtered(still, torch.full((1, 1), 0.5), seen, after, after, torch.tensor([False, True]))[1].tolist()
+        [[0.5], [0.75]]
+    """
+    latent, after = seen.clone(), next_seen.clone()
+    rows = (~continues).nonzero()[:, 0]
+    while len(rows):
+        after[rows] = corrected(dynamics(latent[rows], action[rows]), next_seen[rows], gain)[0]
+        rows = rows[rows + 1 < len(seen)] + 1
+        rows = rows[continues[rows]]
+        latent[rows] = after[rows - 1]
+    return latent, after
+
+
+__all__ = ["LatentObserver", "Predict", "corrected", "filtered", "gain_matrix"]
