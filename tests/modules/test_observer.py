@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
 from torchrl.collectors import Collector
@@ -18,7 +19,8 @@ from torchrl_sspl.evaluation.controllers import AgentController
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
 from torchrl_sspl.modules.agent import Agent, load, mlp_barrier
-from torchrl_sspl.modules.observer import corrected, filtered, gain_matrix
+from torchrl_sspl.modules.controller import Memory
+from torchrl_sspl.modules.observer import corrected, filtered, gain_matrix, held
 
 
 def small_agent(gain: float | Tensor = 0.2, error: float = 0.05) -> Agent:
@@ -158,15 +160,51 @@ def watched(latents: list[float], *, error: float = 0.11, gain: float = 0.5) -> 
     ("latents", "applies"),
     [
         ([0.0, 0.2, 0.3], [True, True, True]),
-        ([0.0, 0.3, 0.3], [True, False, False]),  # corrected by .15
+        ([0.0, 0.49, 0.3], [True, True, True]),  # corrected by much, and still inside
         ([0.6, 0.4], [False, False]),  # it began outside
         ([0.4, 0.55, 0.4], [True, False, False]),  # looks like U, the correction is small
+        ([0.4, 0.9, 0.4], [True, False, False]),
         ([0.0, math.nan], [True, False]),
         ([0.0] * 5, [True] * 5),
     ],
 )
 def test_the_premise_is_watched_and_never_met_again_once_it_was_not(latents, applies):
     assert watched(latents) == applies
+
+
+def test_without_a_memory_no_correction_may_be_larger_than_what_is_tolerated():
+    assert watched([0.0, 0.1, 0.2], gain=1.0) == [True, True, True]
+    assert watched([0.0, 0.2, 0.2], gain=1.0) == [True, False, False]
+
+
+def test_a_correction_that_would_leave_the_set_is_cut_to_what_is_tolerated():
+    prior, wanted = torch.tensor([[0.4, 0.0]] * 3 + [[0.6, 0.0]]), torch.tensor([[0.9, 0.5], [0.45, 0.9], [0.55, 0.0], [0.9, 0.0]])
+    latent, cut = held(lambda z: z[:, :1] - 0.5, prior, wanted, 0.2)
+    # Led out far; moved far inside; led out by less than is tolerated; outside before.
+    assert cut.tolist() == [True, False, False, False]
+    assert torch.equal(latent[1:], wanted[1:])
+    assert torch.allclose(latent[0], prior[0] + 0.2 * torch.tensor([0.5, 0.5]) / math.sqrt(0.5))
+
+
+def test_the_same_corrections_are_cut_in_a_collector_and_in_a_controller():
+    agent = small_agent(error=0.01)
+    with torch.no_grad():
+        agent.barrier[-1].bias.add_(-agent.barrier(agent.encode(frames(64)))[:, 0].median())
+    observer = LatentObserver(agent.encoder, agent.gain, agent.latent_dim, agent.barrier, agent.held_error)
+    prior, seen = agent.encode(frames(64)), agent.encode(frames(64, 1))
+    memory = Memory(agent)
+    memory.correct(prior)
+    memory.expect(prior)
+    latent, _, cut = memory.correct(seen)
+    assert bool(cut.any())
+    begins = torch.zeros(64, 1, dtype=torch.bool)
+    found = observer(TensorDict(pixels=frames(64, 1), prior=prior, is_init=begins, batch_size=[64]))
+    assert torch.equal(found["latent"], latent)
+
+
+def test_an_observer_that_holds_needs_a_set():
+    with pytest.raises(ConfigError, match="barrier"):
+        LatentObserver(FrameEncoder(3, 16, pool_to=8), 0.2, 3, error=0.1)
 
 
 def test_where_nothing_is_proved_no_premise_is_met():

@@ -211,17 +211,18 @@ def _share(
     layer.state(MEASURED, name, text, holds, why, misses_by=None if holds else bound - acceptable, **of)
 
 
-def run_time_layer(record: Record, tolerated_error: float | None) -> Layer:
+def run_time_layer(record: Record, tolerated_error: float | None, held: bool = False) -> Layer:
     r"""To how many real episodes the proof applies, whatever camera and physics did in them.
 
-    The premise at a step: :math:`|\hat z_t - d(\hat z_{t-1}, u_{t-1})| \le \delta`, the correction of the observer,
-    and :math:`B(E(o_t)) \le s`; in an episode: at every step of it. It is watched at run time
+    The premise at a step: :math:`B(E(o_t)) \le s`, and, unless corrections are held in the set,
+    :math:`|\hat z_t - d(\hat z_{t-1}, u_{t-1})| \le \delta`; in an episode: at every step of it. It is watched at run time
     (:class:`~torchrl_sspl.modules.controller.Controller`); with k episodes among n that do not meet it,
     :math:`P \le \operatorname{Beta}^{-1}(c; k + 1, n - k)`.
 
     Args:
         record: how the episodes were drawn, and what was counted.
         tolerated_error: :math:`\delta`, proved, latent units; None where nothing is.
+        held: whether a correction that would leave the set is cut to :math:`\delta`.
 
     Source: Theorem F of ``docs/theory.md``; none in the paper.
 
@@ -249,10 +250,17 @@ def run_time_layer(record: Record, tolerated_error: float | None) -> Layer:
     _share(layer, "covered", text, exceeding, n, record.confidence, record.acceptable, Reason.PREMISE_NOT_MET, detail)
     text = f"steps at which its premise is met: {total.steps - total.uncovered} of {total.steps}; steps are dependent, so no bound follows"
     layer.state(REPORTED, "steps covered", text, n=total.steps)
-    text = (
-        f"the premise, watched at run time: no correction of the observer is above {down(tolerated_error)}, and B <= s for "
-        "every observation by itself; while it is met, B <= s whatever camera and physics do"
-    )
+    limit = down(tolerated_error)
+    if held:
+        text = (
+            f"the premise, watched at run time: B <= s for every observation by itself; the memory keeps B <= s whatever is seen, "
+            f"as a correction that would leave the set is cut to {limit}, which is proved to be tolerated"
+        )
+    else:
+        text = (
+            f"the premise, watched at run time: no error of a step is above {limit}, and B <= s for every observation by "
+            "itself; while it is met, B <= s whatever camera and physics do"
+        )
     layer.state(ASSUMED, "premise", text)
     return layer
 

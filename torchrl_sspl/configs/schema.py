@@ -150,8 +150,6 @@ class SynthesisConfig:
     rounds: int = _option(1, "rounds of data, refit, synthesis and fine-tuning.")
     gain: float = _option(1.0, "gain k of the latent observer: the latent is what was predicted, corrected by this share of "
         "what is seen; 1: what is seen.")
-    gain_share: float = _option(1.0, "share of the gain with which the agent is checked and runs; below 1 the set was trained "
-        "with larger corrections than it meets.")
     episode_steps: int | None = _option(None, "longest episode of the transitions collected for these phases; null is "
         "collector.max_frames_per_traj. An observer learns from episodes, not from single steps.")
     transitions: int = _option(40_000, "encoded transitions of the first round: those of the joint training and, "

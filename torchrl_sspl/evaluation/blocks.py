@@ -122,8 +122,11 @@ class Block:
     reference: Tensor  # these others
 
 
-def counted(e: Episodes, level: float, tolerated: float | None, slack: float = 0.0) -> tuple[dict[str, int], Tensor]:
-    """Events by name, by more than a share of the barrier's range, and the largest error of each episode ``(n,)``."""
+def counted(
+    e: Episodes, level: float, tolerated: float | None, slack: float = 0.0, held: bool = False
+) -> tuple[dict[str, int], Tensor]:
+    """Events by name, by more than a share of the barrier's range, and the largest error of each episode ``(n,)``; ``held``:
+    what would leave the set is cut to what it tolerates."""
     alive, barrier, unsafe = e.alive, e.barrier.double(), (e.region == UNSAFE) & e.alive
     seen = e.seen.double()
     error = torch.where(alive[1:], e.prediction_error.double(), 0.0)
@@ -137,12 +140,18 @@ def counted(e: Episodes, level: float, tolerated: float | None, slack: float = 0
     }
     events["events"] = torch.stack(list(events.values())).any(0)
     limit = 0.0 if tolerated is None else tolerated
-    met = (error <= limit * (1 + slack)) & (seen[1:] <= level + margin) & torch.tensor(limit > 0.0)
+    met = (barrier[1:] <= level + margin) if held else (error <= limit * (1 + slack))
+    met = met & (seen[1:] <= level + margin) & torch.tensor(limit > 0.0)
     missing = ~met & alive[1:]
     # An episode without a step has nothing to show but its first observation.
     exceeding = missing.any(0) | ~((seen[0] <= level + margin) & torch.tensor(limit > 0.0))
     sums = events | {"exceeding": exceeding, "uncovered": missing}
     return {k: int(v.sum()) for k, v in sums.items()}, worst
+
+
+def holds_at(agent: Agent, level: float) -> bool:
+    """Whether corrections are held in {B <= s}; an agent holds them at level zero."""
+    return agent.held_error > 0.0 and level == 0.0
 
 
 def _range(barrier: Tensor, level: float) -> float:
@@ -168,6 +177,7 @@ class StateBlocks:
         self, agent: Agent, env: SafetyEnv, record: Record, level: float, tolerated: float | None = None
     ) -> None:
         self.agent, self.env, self.record, self.level, self.tolerated = hosted(agent), env, record, level, tolerated
+        self.held = holds_at(agent, level)
 
     @torch.no_grad()
     def __call__(self, index: int) -> Block:
@@ -188,8 +198,8 @@ class StateBlocks:
         worst, steps, rims = torch.zeros(0), torch.zeros(0, dtype=torch.int64), dict[str, tuple[int, float]]()
         if run is not None:
             steps, rims = run.alive.sum(0) - 1, _rims(run, self.level)
-            found, worst = counted(run, self.level, self.tolerated)
-            sure = counted(run, self.level, self.tolerated, _BARELY)[0]
+            found, worst = counted(run, self.level, self.tolerated, held=self.held)
+            sure = counted(run, self.level, self.tolerated, _BARELY, self.held)[0]
             counts, least = (replace(NOTHING, episodes=len(start), steps=int(steps.sum()), **k) for k in (found, sure))
         elif len(start):
             k = len(start)
@@ -258,6 +268,7 @@ class ResetBlocks:
         self, agent: Agent, make_env: MakeEnv, record: Record, level: float, tolerated: float | None = None
     ) -> None:
         self.agent, self.make_env, self.record, self.level, self.tolerated = agent, make_env, record, level, tolerated
+        self.held = holds_at(agent, level)
 
     @torch.no_grad()
     def __call__(self, index: int) -> Block:
@@ -280,7 +291,7 @@ class ResetBlocks:
         counts, least = (
             replace(
                 NOTHING, episodes=len(start), steps=int(start.alive[1:].sum()),
-                **counted(start, level, self.tolerated, s)[0],
+                **counted(start, level, self.tolerated, s, self.held)[0],
                 shown=int(shown.any(0).sum()), mistaken=int((shown & ~(barrier > level - m)).any(0).sum()),
                 seen=len(seen), outside=int((~(seen.abs() <= 1.0).all(1)).sum()),
             )

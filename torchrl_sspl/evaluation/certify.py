@@ -46,6 +46,7 @@ from torchrl_sspl.evaluation.blocks import (
     ResetBlocks,
     StateBlocks,
     described_system,
+    holds_at,
     same_resets,
     same_system,
     summarise,
@@ -326,7 +327,7 @@ def _tolerated(certificate: Certificate, agent: Agent) -> float | None:
 def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> dict[str, Layer]:
     return {
         "statistical": statistical_layer(record),
-        "run-time": run_time_layer(record, _tolerated(certificate, agent)),
+        "run-time": run_time_layer(record, _tolerated(certificate, agent), holds_at(agent, certificate.level)),
         "paper": paper_layer(record, agent.lipschitz_bound),
     }
 

@@ -29,6 +29,7 @@ class Decision:
     seen: Tensor = _NONE  # (n,) barrier of what is seen by itself, without memory
     latent: Tensor = _NONE  # (n, p)
     innovation: Tensor = _NONE  # (n, p) what is seen, less what was expected
+    cut: Tensor = _NONE  # (n,) bool, whether its correction was cut so that the set is not left
     predicted: Tensor = _NONE  # (n, p) the next latent that it expects
     predicted_barrier: Tensor = _NONE  # (n,) barrier of the latter
 
@@ -131,7 +132,7 @@ class AgentController:
         #: Whether ``step`` takes a camera, too.
         self.streams = self.driver is None or getattr(self.driver, "streams", False)
         self._split = hasattr(agent.encoder, "frames") and hasattr(agent.encoder, "head")
-        self._memory = Memory(self.agent.gain)
+        self._memory = Memory(self.agent)
         self.reset()
 
     def reset(self, rows: Tensor | None = None) -> None:
@@ -168,8 +169,8 @@ class AgentController:
     def _judge(self, observation: Tensor | Camera, rows: Tensor | None) -> Decision:
         """What is thought of all n episodes after a look at some of them."""
         seen, barrier = self._see(observation, rows), self.agent.barrier
-        latent, innovation = self._memory.correct(seen)
-        return Decision(barrier=barrier(latent)[:, 0], seen=barrier(seen)[:, 0], latent=latent, innovation=innovation)
+        latent, innovation, cut = self._memory.correct(seen)
+        return Decision(barrier=barrier(latent)[:, 0], seen=barrier(seen)[:, 0], latent=latent, innovation=innovation, cut=cut)
 
     def _see(self, observation: Tensor | Camera, rows: Tensor | None) -> Tensor:
         """Encoded observations of all n episodes, after a look at some of them."""

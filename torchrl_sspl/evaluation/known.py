@@ -297,6 +297,9 @@ def _from_the_set(run: _Run) -> None:
     touched, left = env.unsafe_set.contains(found.states).any(0), (barrier > 0).any(0)
     out.count("safe_rollouts_touch_unsafe", touched, note)
     out.count("safe_rollouts_leave", left, note)
+    if run.agent is not None and run.agent.held_error > 0:  # of the memory it is proved; what is seen may lie outside
+        out.count("safe_rollouts_seen_outside", (found.seen > 0).any(0), f"{note}, B > 0 for an observation by itself")
+        out.count("corrections_cut", found.cut[1:].flatten(), f"steps of {note}, correction that would leave the set")
     error, barrier_error = found.prediction_error, found.barrier_error
     if error is not None and barrier_error is not None:
         quantiles(out, "on_policy_error", error.amax(0), "latent", "largest error of an episode")

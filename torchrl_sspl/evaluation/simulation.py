@@ -33,6 +33,7 @@ class Episodes:
         seen: ``(T + 1, n)`` B(E(o_t)), of what was observed by itself.
         latent: ``(T + 1, n, p)``.
         innovation: ``(T + 1, n, p)`` E(o_t) less what was expected; zero where an episode begins.
+        cut: ``(T + 1, n)`` bool, where a correction was cut so that the set is not left.
         prediction_error: ``(T, n)`` norm of z_{t+1} - d(z_t, u_t), of which without an observer z_{t+1} = E(o_{t+1}).
         barrier_error: ``(T, n)`` B(z_{t+1}) - B(d(z_t, u_t)).
         frames: ``(T + 1, k, 3, H, W)`` uint8 what the first k episodes showed, where asked for.
@@ -47,6 +48,7 @@ class Episodes:
     seen: Tensor = _NONE
     latent: Tensor = _NONE
     innovation: Tensor = _NONE
+    cut: Tensor = _NONE
     prediction_error: Tensor = _NONE
     barrier_error: Tensor = _NONE
     frames: Tensor = _NONE
@@ -162,7 +164,8 @@ class _Record:
         values = {"barrier": decision.barrier, "seen": decision.seen}
         if gone is not None:
             values = {k: None if v is None else v.masked_fill(gone, -1.0) for k, v in values.items()}
-        self.add(region=region, alive=alive.clone(), latent=decision.latent, innovation=decision.innovation, **values)
+        kept = {k: getattr(decision, k) for k in ("latent", "innovation", "cut")}
+        self.add(region=region, alive=alive.clone(), **kept, **values)
 
     def compare(self, before: Decision, after: Decision, gone: Tensor | None = None) -> None:
         """How far a step led from where it was expected to."""

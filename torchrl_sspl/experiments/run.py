@@ -253,7 +253,7 @@ class Experiment:
     def agent(self) -> Agent:
         """A frozen copy of the present networks, their level placed where the phases have put it."""
         nets = self.encoder, self.dynamics, self.barrier, self.policy
-        options: dict[str, Any] = {"level": self.work.level, "gain": self.work.running_gain, "description": self.work.description}
+        options: dict[str, Any] = {"level": self.work.level, "gain": self.work.gain, "description": self.work.description}
         return Agent.from_networks(*nets, **options)
 
     def train(self, *, resume: bool = True) -> Agent:

@@ -170,6 +170,12 @@ class Agent(nn.Module):
         return float(self.description.get("tolerated_error", 0.0))
 
     @property
+    def held_error(self) -> float:
+        """What corrections of the memory are cut to where they would leave the set: the tolerated error; 0 where K = I."""
+        remembers = not torch.equal(self.gain.cpu(), torch.eye(self.latent_dim))
+        return self.tolerated_error if remembers else 0.0
+
+    @property
     def latent_dim(self) -> int:
         """Size of the latent."""
         return int(self.barrier[0].in_features)  # type: ignore[index, union-attr]

@@ -9,25 +9,26 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.modules.observer import corrected
+from torchrl_sspl.modules.observer import corrected, held
 
 
 class Memory:
     r"""The observer's state for n episodes side by side: what is expected to be seen next. Source: none.
 
     Args:
-        gain: K ``(p, p)``.
+        agent: gives K, and the set in which its corrections are held where the agent is proved to tolerate an error.
 
     Example:
-        >>> memory = Memory(0.5 * torch.eye(1))
-        >>> latent, _ = memory.correct(torch.zeros(2, 1))
-        >>> memory.expect(latent + 1.0)
-        >>> memory.correct(torch.zeros(2, 1))[0].tolist()
-        [[0.5], [0.5]]
+        >>> from torchrl_sspl.modules.agent import load
+        >>> memory = Memory(load("pendulum"))
+        >>> latent, innovation, cut = memory.correct(torch.zeros(2, 3))
+        >>> memory.expect(latent + 0.1)
+        >>> bool((memory.correct(torch.zeros(2, 3))[0] > 0).all())
+        True
     """
 
-    def __init__(self, gain: Tensor) -> None:
-        self.gain = gain
+    def __init__(self, agent: Any) -> None:
+        self.agent = agent
         self.prior: Tensor | None = None
         self.begins: Tensor | None = None  # (n,) bool
 
@@ -38,11 +39,15 @@ class Memory:
         elif self.begins is not None:
             self.begins[rows] = True
 
-    def correct(self, seen: Tensor) -> tuple[Tensor, Tensor]:
-        """Latents and innovations ``(n, p)`` for what is seen, ``(n, p)``; nothing is remembered."""
+    def correct(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Latents and innovations ``(n, p)`` for what is seen ``(n, p)``, and where a correction was cut ``(n,)``; nothing is
+        remembered."""
         if self.begins is None or self.prior is None:
             self.prior, self.begins = seen, torch.ones(len(seen), dtype=torch.bool, device=seen.device)
-        return corrected(torch.where(self.begins[:, None], seen, self.prior), seen, self.gain)
+        expected, agent = torch.where(self.begins[:, None], seen, self.prior), self.agent
+        latent, innovation = corrected(expected, seen, agent.gain)
+        latent, cut = held(agent.barrier, expected, latent, agent.held_error)
+        return latent, innovation, cut
 
     def expect(self, predicted: Tensor, rows: Tensor | None = None) -> None:
         """Predictions ``(n, p)`` for the next step, of all or of some of the episodes."""
@@ -75,9 +80,12 @@ class Controller:
         \hat z_0 = E(o_0), \qquad \hat z_t = \operatorname{clamp}(p_t + K (E(o_t) - p_t)), \qquad
         p_{t+1} = d(\hat z_t, u_t), \qquad u_t = \pi(\hat z_t)
 
-    The premise of the proof (Theorem F in ``docs/theory.md``) is watched from what is seen anyway: the episode began in the set, no
-    correction :math:`|\hat z_t - p_t|` was above the tolerated error :math:`\delta`, and nothing that was seen looks
-    like U, :math:`B(E(o_t)) \le 0`. Numbers that are not finite meet no premise. Source: none.
+    A correction that would leave the set is cut to the error :math:`\delta` that the set is proved to tolerate
+    (:func:`~torchrl_sspl.modules.observer.held`): :math:`B(\hat z_t) \le 0` is kept whatever is seen. What is seen has to agree:
+    the premise of the proof (Theorem F in ``docs/theory.md``), watched at every step, is that the episode began in the set
+    and that every observation by itself lies in it, :math:`B(E(o_t)) \le 0`. Where K = I nothing is cut, and no correction may
+    be above :math:`\delta`. Numbers that are not finite meet no premise.
+    Source: none.
 
     Args:
         agent: frozen agent; ``agent.tolerated_error`` is :math:`\delta`, zero where nothing is proved.
@@ -97,7 +105,7 @@ class Controller:
         if not isinstance(batch_size, int) or batch_size < 1:
             raise ConfigError(f"expected batch_size >= 1, received {batch_size!r}")
         self.agent, self.batch_size = agent, batch_size
-        self._memory = Memory(agent.gain)
+        self._memory = Memory(agent)
         self._applies = torch.ones(batch_size, dtype=torch.bool, device=agent.gain.device)
 
     def reset(self, rows: Tensor | None = None) -> None:
@@ -113,12 +121,13 @@ class Controller:
             raise ShapeError(f"expected pixels of {self.batch_size} systems, received {len(pixels)}; make a controller for them")
         agent, memory = self.agent, self._memory
         seen = agent.encode(pixels.to(agent.gain.device))
-        latent, innovation = memory.correct(seen)
-        expected = torch.where(memory.begins[:, None], seen, memory.prior)  # type: ignore[index, arg-type]
+        latent, innovation, _ = memory.correct(seen)
         action, barrier = agent.policy(latent), agent.barrier(latent)[:, 0]
-        error = (latent - expected).norm(dim=-1)
+        error = (latent - (seen - innovation)).norm(dim=-1)
         # A comparison with a number that is none is false.
-        met = (error <= agent.tolerated_error) & (agent.barrier(seen)[:, 0] <= 0.0) & (barrier <= 0.0)
+        met = (agent.barrier(seen)[:, 0] <= 0.0) & (barrier <= 0.0)
+        if not agent.held_error > 0.0:
+            met &= error <= agent.tolerated_error
         if not agent.tolerated_error > 0.0:
             met = torch.zeros_like(met)
         self._applies = self._applies & met

@@ -2,7 +2,7 @@ r"""The latent observer: a memory that believes its own prediction, and corrects
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -62,6 +62,34 @@ def corrected(prior: Tensor, seen: Tensor, gain: Tensor) -> tuple[Tensor, Tensor
     return (seen - innovation @ left.mT).clamp(-1.0, 1.0), innovation
 
 
+def held(barrier: Callable[[Tensor], Tensor], prior: Tensor, latent: Tensor, error: float) -> tuple[Tensor, Tensor]:
+    r"""The corrected latent, its correction cut to a length where the whole of it would leave the set of the prior.
+
+    .. math:: \hat z = p + \delta \frac{\hat z' - p}{\lVert \hat z' - p \rVert} \quad \text{where } B(p) \le 0 < B(\hat z')
+
+    A set that is proved to tolerate an error :math:`\delta` at every step is then not left, whatever is seen. Source: none
+    (in filtering, the projection of a constrained estimate).
+
+    Args:
+        barrier: latent -> barrier value ``(*batch, 1)``, at most zero means inside.
+        prior, latent: before and after the correction, ``(*batch, p)``.
+        error: :math:`\delta`, latent units; 0: nothing is cut.
+
+    Returns latents ``(*batch, p)`` and where something was cut ``(*batch,)``.
+
+    Example:
+        >>> held(lambda z: z - 0.5, torch.zeros(2, 1), torch.tensor([[0.4], [0.6]]), 0.1)
+        (tensor([[0.4000],
+                [0.1000]]), tensor([False,  True]))
+    """
+    if not error > 0.0:
+        return latent, torch.zeros_like(latent[..., 0], dtype=torch.bool)
+    moved = latent - prior
+    length = moved.norm(dim=-1, keepdim=True)
+    leaves = (barrier(prior) <= 0.0) & (barrier(latent) > 0.0) & (length > error)
+    return torch.where(leaves, (prior + moved * (error / length)).clamp(-1.0, 1.0), latent), leaves[..., 0]
+
+
 class LatentObserver(TensorDictModuleBase):
     r"""Encoder with a memory: the latent that was predicted, corrected by a share of what is seen.
 
@@ -79,6 +107,7 @@ class LatentObserver(TensorDictModuleBase):
         encoder: observation -> latent ``(*batch, p)`` in [-1, 1].
         gain: K, a number or ``(p, p)``; see :func:`gain_matrix`, for errors too.
         latent_dim: p.
+        barrier, error: the set in which corrections are held, see :func:`held`; none by default.
 
     Source: none (Luenberger's observer on a learned latent; in world models prior and posterior); the paper has K = I.
 
@@ -95,8 +124,18 @@ class LatentObserver(TensorDictModuleBase):
 
     gain: Tensor
 
-    def __init__(self, encoder: nn.Module, gain: float | Sequence[Any] | Tensor, latent_dim: int) -> None:
+    def __init__(
+        self,
+        encoder: nn.Module,
+        gain: float | Sequence[Any] | Tensor,
+        latent_dim: int,
+        barrier: nn.Module | None = None,
+        error: float = 0.0,
+    ) -> None:
         super().__init__()
+        if error > 0.0 and barrier is None:
+            raise ConfigError(f"expected a barrier with error={error}, received none; give the one whose set tolerates it")
+        self.barrier, self.error = barrier, error
         self.encoder = as_tensordict_module(encoder, ["pixels"], ["latent"])
         self.latent_dim = latent_dim
         self.register_buffer("gain", gain_matrix(gain, latent_dim))
@@ -109,7 +148,10 @@ class LatentObserver(TensorDictModuleBase):
         prior, begins = tensordict["prior"], tensordict["is_init"]
         if prior.shape != seen.shape:
             raise ShapeError(f"expected a prior of shape {tuple(seen.shape)}, received {tuple(prior.shape)}; add the primer")
-        latent, innovation = corrected(torch.where(begins, seen, prior), seen, self.gain)
+        expected = torch.where(begins, seen, prior)
+        latent, innovation = corrected(expected, seen, self.gain)
+        if self.barrier is not None:
+            latent = held(self.barrier, expected, latent, self.error)[0]
         return tensordict.set(self.out_keys[0], latent).set("innovation", innovation)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
@@ -171,4 +213,4 @@ def filtered(
     return latent, after
 
 
-__all__ = ["LatentObserver", "Predict", "corrected", "filtered", "gain_matrix"]
+__all__ = ["LatentObserver", "Predict", "corrected", "filtered", "gain_matrix", "held"]

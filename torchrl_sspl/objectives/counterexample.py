@@ -53,7 +53,7 @@ class CounterexampleLoss(LatentLoss):
         barrier: nn.Module,
         policy: nn.Module,
         *,
-        depth: float = 0.03,
+        depth: float = 0.01,
         cap: float = 0.05,
         policy_coeff: float = 0.3,
         error: float = 0.0,

@@ -245,12 +245,7 @@ class Workspace:
     def agent(self, level: float | None = None) -> Agent:
         """A frozen copy of the present networks; {B <= level} becomes {B <= 0}."""
         level, nets = self.level if level is None else level, self.networks.values()
-        return Agent.from_networks(self.encoder, *nets, level=level, gain=self.running_gain, description=self.description)
-
-    @property
-    def running_gain(self) -> Tensor:
-        """Gain with which the agent runs."""
-        return self.gain if not self.observing else self.config.gain_share * self.gain
+        return Agent.from_networks(self.encoder, *nets, level=level, gain=self.gain, description=self.description)
 
     def keep(self, rank: Any, number: int, level: float) -> None:
         """Remember the present networks as the best so far."""

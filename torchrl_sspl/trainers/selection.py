@@ -23,7 +23,7 @@ _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out che
 _LOWEST_LEVEL = -0.2
 _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away from what the set tolerates
 _UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
-_STEP, _LOWER = 4, 3  # levels between two of the lower ones for which a proof is tried, and how many of these
+_STEP, _TRIED = 2, 6  # levels between two for which a proof is tried, and how many of these
 _BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
 
 
@@ -45,9 +45,9 @@ class CheckRound(Phase):
 
     The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations
     of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim,
-    in the first steps, so many short episodes say more than few long ones. Then the weights say which error the set
-    tolerates (branch and bound), and so to how many of these episodes the proof applies; where they are few, lower
-    levels are tried, too. An observer that believes itself more than what it sees keeps a constant innovation; a set is
+    in the first steps, so many short episodes say more than few long ones. Where a proof is asked for, a level passes if the
+    weights say that its set tolerates an error (branch and bound), the checks are made with the memory held in the set,
+    and the proof applies to enough of the episodes. An observer that believes itself more than what it sees keeps a constant innovation; a set is
     refused where the mean innovation of an episode is larger than single ones under random actions ever are.
     Source: none; the paper stops at a total loss of zero.
     """
@@ -65,8 +65,8 @@ class CheckRound(Phase):
             lowest = -_MOST_OF_MARGIN * work.config.margin - 1e-6  # below it the condition says nothing of the level
             checks = (self._check(work, held_out, level) for level in levels if level >= lowest)
             found = next((c for c in checks if c.passed), None) or self._check(work, held_out, 0.0)
-            if found.passed and work.config.cover_share > 0:
-                found = self._proved(work, held_out, found, [v for v in levels if lowest <= v < found.level])
+            if work.config.cover_share > 0:
+                found = self._proved(work, held_out, levels) or found
         work.checks.append(found)
         work.log({"step": self.number, **{k: v for k, v in vars(found).items() if not isinstance(v, str)}})
         # Of the sets that passed, one into which starts in U return counts first, then the largest.
@@ -75,24 +75,35 @@ class CheckRound(Phase):
         if found.passed and (work.best is None or rank >= list(work.best["rank"])):
             work.keep(rank, self.number, found.level)
 
-    def _proved(self, work: Workspace, held_out: _HeldOut, first: Check, lower: list[float]) -> Check:
-        """The largest set to whose episodes the proof applies, among what passed and a few lower levels; or the first."""
-        candidates = [first, *(self._check(work, held_out, level) for level in lower[_STEP - 1 :: _STEP][:_LOWER])]
-        for check in candidates:
-            if not check.passed:
+    def _proved(self, work: Workspace, held_out: _HeldOut, levels: list[float]) -> Check | None:
+        """The largest set that is proved to be kept and passes, with its memory held in it, among a few levels; or None."""
+        s = work.config
+        apart = [v for v in levels if not any(self._mixed(held_out, v, s.guard))]
+        for level in apart[::_STEP][:_TRIED]:
+            agent = work.agent(level)
+            agent.description["tolerated_error"] = tolerated = premise(agent)
+            fresh = self._held_out(work, agent) if tolerated > 0 else None
+            if fresh is None:
                 continue
-            check.tolerated = premise(work.agent(check.level))
-            check.covered = self._covered(held_out.episodes, check)
-            if check.covered >= work.config.cover_share:
+            check = self._check(work, fresh, 0.0)
+            check.level, check.tolerated, check.covered = level, tolerated, self._covered(fresh.episodes, agent)
+            if check.passed and check.covered >= s.cover_share:
                 return check
-        return max((c for c in candidates if c.passed), key=lambda c: c.covered)
+        return None
 
     @staticmethod
-    def _covered(run: Episodes, check: Check) -> float:
+    def _mixed(held_out: _HeldOut, level: float, guard: float) -> tuple[int, int]:
+        """Observations of U inside the set, and of S outside."""
+        return int((held_out.unsafe <= level + guard).sum()), int((held_out.safe > level).sum())
+
+    @staticmethod
+    def _covered(run: Episodes, agent: Agent) -> float:
         """Share of the episodes from the set that meet the premise of the proof at every step."""
-        inside = run.seen[0] <= check.level
-        met = (run.prediction_error <= check.tolerated).all(0) & (run.seen <= check.level).all(0)
-        return float(met[inside].float().mean()) if check.tolerated > 0 and bool(inside.any()) else 0.0
+        assert run.barrier is not None
+        met = (run.seen <= 0) & (run.barrier <= 0)
+        if not agent.held_error > 0:
+            met[1:] &= run.prediction_error <= agent.tolerated_error
+        return float(met.all(0)[run.barrier[0] <= 0].float().mean())
 
     def _held_out(self, work: Workspace, agent: Agent) -> _HeldOut | None:
         s, source = work.config, work.source
@@ -127,7 +138,7 @@ class CheckRound(Phase):
         inside = run.barrier[0] <= level
         left = int((inside & (run.barrier[1:] > level).any(0)).sum())
         touched = int(((run.barrier <= level) & late).any(0).sum())
-        bad, out = int((held_out.unsafe <= level + s.guard).sum()), int((held_out.safe > level).sum())
+        bad, out = self._mixed(held_out, level, s.guard)
         returned = float(((back.barrier[-1] <= level) & (back.region[-1] != UNSAFE)).float().mean())
         size = float((held_out.anywhere <= level).float().mean())
         tolerated = s.leave_share * int(inside.sum())

@@ -47,17 +47,17 @@ _MOST_ACTIONS = 729  # in the grid that is tried at every latent
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data tolerates
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
-_MARGIN = 2.6  # of the condition on the data while counterexamples are worked off, per error that is to be tolerated
 _WEIGHT = 2.0  # of counterexamples
 _POOL = 8192  # counterexamples that are kept
-_UNROLLED = 12  # steps through the observer
+_UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
 
 class Gather(Phase):
     """Encoded transitions: those of the joint training and random actions in the first round, the policy's own afterwards.
 
-    Where the environment knows its sets, further rounds add transitions of the exploring policy that start in the set
+    A memory drifts along the paths that a policy takes, not along random ones: behind an observer the first round adds
+    episodes of the policy of the joint training, too. Where the environment knows its sets, further rounds add transitions of the exploring policy that start in the set
     or near it, and of many that start in U those whose pictures the present barrier puts lowest: the rim of U is where
     a set goes wrong first. Elsewhere they add episodes of the exploring policy from the environment's own resets.
     Source: paper Algorithm 1 (rollouts join D); deviation: which of them are kept is decided by their pictures.
@@ -75,6 +75,8 @@ class Gather(Phase):
             parts = [] if stored is None else [stored]
             if missing > 0 and (source.known or stored is None):
                 parts.append(source.random(missing, 0))
+            if work.observing and source.known:
+                parts.append(self._rollouts(work, 15, torch.eye(work.latent_dim)))
         else:
             parts = [work.latents, self._near_the_set(work)]
             if source.known and s.rim_transitions:
@@ -92,14 +94,10 @@ class Gather(Phase):
 
     def _near_the_set(self, work: Workspace) -> dict[str, Tensor]:
         s, source = work.config, work.source
-        region = source.outside_unsafe if source.known else None
-        memory: dict[str, Any] = {"dynamics": work.dynamics, "gain": work.gain} if work.observing else {}
         found: list[dict[str, Tensor]] = []
         count = 0
         for attempt in range(10):
-            part = source.under(
-                work.policy, s.rollout_transitions, 20 * self.number + attempt, exploration=s.exploration, region=region, **memory
-            )
+            part = self._rollouts(work, 20 * self.number + attempt, work.gain)
             with torch.no_grad():
                 near = work.barrier(work.filtered(part)["latent"])[:, 0] < _NEAR
             # What goes on after a transition that is left out would begin a new episode there.
@@ -109,6 +107,14 @@ class Gather(Phase):
             if count >= s.rollout_transitions or not source.known:
                 break
         return {k: torch.cat([f[k] for f in found])[: s.rollout_transitions] for k in found[0]}
+
+    @staticmethod
+    def _rollouts(work: Workspace, index: int, gain: Tensor) -> dict[str, Tensor]:
+        """Transitions of the exploring policy, behind an observer of a gain where the agent will have one."""
+        s, source = work.config, work.source
+        region = source.outside_unsafe if source.known else None
+        memory: dict[str, Any] = {"dynamics": work.dynamics, "gain": gain} if work.observing else {}
+        return source.under(work.policy, s.rollout_transitions, index, exploration=s.exploration, region=region, **memory)
 
     @torch.no_grad()
     def _rim(self, work: Workspace) -> dict[str, Tensor]:
@@ -259,9 +265,12 @@ class FineTune(_Training):
             drawn = [pick(len(table), s.batch)]
             drawn += [rows[pick(len(rows), n)] for rows, n in shares if len(rows)]
             asked = rim[pick(len(rim), 3 * s.batch // 2)]
-            error = asked["residual"][torch.arange(len(asked)), pick(s.residuals, len(asked))]
-            if s.tolerated_error > 0:  # the margin stands for all errors
-                error = torch.zeros_like(error)
+            if s.tolerated_error > 0:  # the worst of them
+                with torch.no_grad():
+                    after = work.dynamics(asked["latent"], work.policy(asked["latent"]))
+                error = worst_error(work.barrier, after, s.tolerated_error)
+            else:
+                error = asked["residual"][torch.arange(len(asked)), pick(s.residuals, len(asked))]
             asked = asked.exclude("residual").set("residual", error)
             if s.counterexamples:
                 asked = self._with_counterexamples(work, asked)
@@ -328,9 +337,6 @@ class Tighten(FineTune):
 
     def rates(self, work: Workspace) -> dict[nn.Module, float]:
         return {work.barrier: 0.5 * work.config.lr, work.policy: 0.5 * work.config.lr}
-
-    def margin(self, config: SynthesisConfig) -> float:
-        return max(config.margin, _MARGIN * config.tolerated_error)
 
     def run(self, work: Workspace) -> None:
         if work.loop.step == 0:
