@@ -25,7 +25,7 @@ if "SSPL/QuadrupedObstacle-v0" not in gymnasium.registry:
 
 _SUBPACKAGES = (
     "certification", "configs", "data", "envs", "errors", "evaluation", "experiments", "functional", "lipschitz", "modules",
-    "objectives", "sets", "trainers", "viability", "viz",
+    "objectives", "runtime", "sets", "trainers", "viability", "viz",
 )  # fmt: skip
 _NAMES = {
     "Agent": "modules.agent",
@@ -47,6 +47,8 @@ _NAMES = {
     "evaluate": "evaluation.known",
     "certify": "evaluation.certify",
     "Certificate": "certification.certificate",
+    "SafetyFilter": "runtime",
+    "SafetyWrapper": "runtime",
 }
 
 __all__ = ["__version__", *_NAMES, *_SUBPACKAGES]

@@ -1,0 +1,193 @@
+r"""The safety filter: any policy's actions, changed where the agent's set would not surely be kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+from torch import Tensor
+
+from torchrl_sspl.certification.conditions import closed_loop
+from torchrl_sspl.certification.floating import UNITS, largest_rounding
+from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.observer import LatentObserver
+
+MODES = ("nearest", "blend")
+_GRID, _MOST = 81, 729  # actions per dimension that are tried, and in all
+_LINE, _HALVINGS = 16, 8  # actions on the way to the agent's own one, and halvings of what is left of the way
+
+
+@dataclass
+class Protected:
+    """What the filter makes of n actions."""
+
+    action: Tensor  # (n, m), physical units
+    intervened: Tensor  # (n,) bool, whether it is another one than was wanted
+    deviation: Tensor  # (n,) distance of the two, in half ranges of the action
+    margin: Tensor  # (n,) barrier units by which the successor is surely inside; below zero where that is not so
+
+
+class Shield:
+    r"""Lets actions through that surely keep the set, and takes near ones that do in place of the others.
+
+    .. math::
+        u' = \begin{cases} u & B(d(\hat z, u)) + \eta \le 0 \\ \arg\min_{v \in V,\; B(d(\hat z, v)) + \eta \le 0}
+        \lVert (v - u) / u_{\max} \rVert & \text{else} \\ \pi(\hat z) & \text{where no } v \in V \text{ does, or } B(\hat z) > 0
+        \end{cases}
+
+    with :math:`\eta = L_B \delta + 2 \epsilon_B`, the error that the set is proved to tolerate and what the barrier's evaluation
+    may round off, and V a grid over all actions together with the way from u to :math:`\pi(\hat z)`; what is left of the way from u is
+    halved a few times. That :math:`\pi(\hat z)` keeps the set is what [V] says (Theorem G in ``docs/theory.md``). Source: none
+    (least-restrictive filters of model-based control, on latents).
+
+    Args:
+        agent: frozen agent with a tolerated error, so that [V] is proved.
+        mode: ``"nearest"``, or ``"blend"``: V is the way to :math:`\pi(\hat z)` alone, which changes smoothly with u.
+        level: act as if the set were :math:`\{B \le s\}`, s <= 0: earlier than needed.
+        margin: :math:`\eta` in place of the proved one, for an agent without a proof: then nothing is guaranteed.
+
+    Raises:
+        ConfigError: for an agent without a proof where no margin is given, or options that are not valid.
+
+    Example:
+        >>> from torchrl_sspl.modules.agent import load
+        >>> shield = Shield(load("pendulum"))
+        >>> shield(torch.zeros(4, 3), torch.full((4, 1), 10.0)).action.shape
+        torch.Size([4, 1])
+    """
+
+    def __init__(self, agent: Agent, *, mode: str = "nearest", level: float = 0.0, margin: float | None = None) -> None:
+        if mode not in MODES or not level <= 0.0 or (margin is not None and not margin >= 0.0):
+            raise ConfigError(
+                f"expected mode in {MODES}, level <= 0 and margin >= 0 or None, received {mode!r}, {level} and {margin}"
+            )
+        if margin is None and not agent.tolerated_error > 0.0:
+            raise ConfigError(
+                "expected an agent whose set is proved to be kept (a tolerated error above 0), received one without; see what "
+                "`sspl verify` says of it, or give margin=0.02 and the like: then the filter guarantees nothing"
+            )
+        self.agent, self.mode, self.level = agent, mode, float(level)
+        self.margin = _proved_margin(agent) if margin is None else float(margin)
+        scale = agent.policy.action_scale.flatten()  # type: ignore[operator, union-attr]
+        self.scale, m = scale, len(scale)
+        per_dimension = max(3, min(_GRID, int(_MOST ** (1 / m) + 1e-6)))
+        axes = [torch.linspace(-float(s), float(s), per_dimension) for s in scale]
+        self.grid = torch.cartesian_prod(*axes).reshape(-1, m) if per_dimension**m <= 4 * _MOST else torch.zeros(0, m)
+
+    @torch.no_grad()
+    def __call__(self, latent: Tensor, wanted: Tensor) -> Protected:
+        """Actions ``(n, m)`` in place of wanted ones ``(n, m)``, in physical units, at latents ``(n, p)``.
+
+        What lies beyond the range is clipped. A ShapeError for another size, a NonFiniteError for NaN.
+        """
+        m = len(self.scale)
+        if wanted.shape != (len(latent), m):
+            raise ShapeError(f"expected actions of shape ({len(latent)}, {m}), received {tuple(wanted.shape)}")
+        if not bool(wanted.isfinite().all()):
+            raise NonFiniteError("expected finite actions, received NaN or infinity from the policy that is to be protected")
+        scale = self.scale.to(wanted)
+        asked = wanted.clamp(-scale, scale)
+        own, inside = self.agent.policy(latent), self.agent.barrier(latent)[:, 0] <= 0.0
+        taken = torch.where((inside & (self._margin(latent, asked) >= 0.0))[:, None], asked, own)
+        rows = (inside & (self._margin(latent, asked) < 0.0)).nonzero()[:, 0]
+        if len(rows):
+            taken[rows] = self._near(latent[rows], asked[rows], own[rows])
+        change = (taken - wanted) / scale
+        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self._margin(latent, taken))
+
+    def _margin(self, latent: Tensor, action: Tensor) -> Tensor:
+        """``(n,)`` by how much successors are surely inside."""
+        return self.level - self.margin - self.agent.barrier(self.agent.dynamics(latent, action))[:, 0]
+
+    def _near(self, latent: Tensor, asked: Tensor, own: Tensor) -> Tensor:
+        """The nearest actions tried that keep the set; the agent's own ones where none does."""
+        n, m = asked.shape
+        share = torch.linspace(0.0, 1.0, _LINE + 1, device=asked.device)[1:, None]
+        tried = asked[:, None] + share * (own - asked)[:, None]
+        if self.mode == "nearest" and len(self.grid):
+            tried = torch.cat([tried, self.grid.to(asked).expand(n, -1, m)], 1)
+        k = tried.shape[1]
+        keeps = self._margin(latent.repeat_interleave(k, 0), tried.reshape(-1, m)).reshape(n, k) >= 0.0
+        distance = ((tried - asked[:, None]) / self.scale.to(asked)).norm(dim=-1).masked_fill(~keeps, float("inf"))
+        best = tried[torch.arange(n), distance.argmin(1)]
+        found = keeps.any(1, keepdim=True)
+        kept, lost = torch.ones(n, 1, device=asked.device), torch.zeros(n, 1, device=asked.device)
+        for _ in range(_HALVINGS):
+            middle = (kept + lost) / 2
+            good = (self._margin(latent, torch.lerp(asked, best, middle)) >= 0.0)[:, None]
+            kept, lost = torch.where(good, middle, kept), torch.where(good, lost, middle)
+        return torch.where(found, torch.where(kept < 1.0, torch.lerp(asked, best, kept), best), own)
+
+
+def _proved_margin(agent: Agent) -> float:
+    r""":math:`L_B \delta + 2 \epsilon_B`."""
+    system = closed_loop(
+        agent.barrier, agent.dynamics, agent.policy, latent_dim=agent.latent_dim, lipschitz_bound=agent.lipschitz_bound
+    )
+    unit = UNITS[next(agent.barrier.parameters()).dtype]
+    rounding = largest_rounding(system.barrier, system.low, system.high, unit)
+    return agent.lipschitz_bound * agent.tolerated_error + 2.0 * rounding
+
+
+class SafetyFilter(TensorDictModuleBase):
+    r"""Behind any TorchRL policy: reads its ``"action"``, writes one that keeps the agent's set; see :class:`Shield`.
+
+    The agent's memory is a hidden state in TorchRL's way, as for :class:`~torchrl_sspl.modules.LatentObserver`: the environment
+    needs ``InitTracker`` and the transform of :meth:`make_tensordict_primer`. Written are ``"action"``, ``"intervened"``
+    ``(*batch, 1)`` bool, ``"deviation"`` and ``"safety_margin"`` ``(*batch, 1)``, ``"latent"``, ``"innovation"`` and
+    ``("next", "prior")``. Source: none.
+
+    Args:
+        agent: frozen agent.
+        **options: of :class:`Shield`; errors too.
+
+    Example:
+        >>> from tensordict.nn import TensorDictModule, TensorDictSequential
+        >>> from torchrl.envs import Compose, InitTracker, TransformedEnv
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> from torchrl_sspl.modules.agent import load
+        >>> protect = SafetyFilter(load("pendulum"))
+        >>> pushes = TensorDictModule(lambda pixels: torch.full((len(pixels), 1), 10.0), ["pixels"], ["action"])
+        >>> env = PendulumEnv(batch_size=[2], seed=0)
+        >>> env.initial_set = env.safe_set
+        >>> env = TransformedEnv(env, Compose(InitTracker(), protect.make_tensordict_primer()))
+        >>> bool((env.rollout(20, TensorDictSequential(pushes, protect))["next", "region"] == 2).any())
+        False
+    """
+
+    def __init__(self, agent: Agent, **options: Any) -> None:
+        super().__init__()
+        self.agent, self.shield = agent, Shield(agent, **options)
+        self.observer = LatentObserver(agent.encoder, agent.gain, agent.latent_dim, agent.barrier, agent.held_error)
+        self.in_keys = [*self.observer.in_keys, "action"]
+        self.out_keys: list[Any] = [
+            *self.observer.out_keys, "action", "intervened", "deviation", "safety_margin", ("next", "prior"),
+        ]  # fmt: skip
+
+    @torch.no_grad()
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replace ``"action"`` ``(*batch, m)``, and say what was done."""
+        batch = tensordict.batch_size
+        seen = self.observer(tensordict.select(*self.observer.in_keys))
+        latent = seen["latent"]
+        rows, wanted = latent.reshape(-1, latent.shape[-1]), tensordict["action"]
+        made = self.shield(rows, wanted.reshape(-1, wanted.shape[-1]))
+        after = self.agent.dynamics(rows, made.action)
+        found = {
+            "latent": latent, "innovation": seen["innovation"], "action": made.action, "intervened": made.intervened[:, None],
+            "deviation": made.deviation[:, None], "safety_margin": made.margin[:, None], ("next", "prior"): after,
+        }  # fmt: skip
+        for key, value in found.items():
+            tensordict.set(key, value.reshape(*batch, value.shape[-1]))
+        return tensordict
+
+    def make_tensordict_primer(self) -> Any:
+        """The transform that gives an environment the key ``"prior"``."""
+        return self.observer.make_tensordict_primer()
+
+
+__all__ = ["Protected", "SafetyFilter", "Shield"]
