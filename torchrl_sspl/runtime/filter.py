@@ -17,6 +17,7 @@ from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.observer import LatentObserver
 
 MODES = ("nearest", "blend")
+LEVEL = -0.1
 _GRID, _MOST = 81, 729  # actions per dimension that are tried, and in all
 _LINE, _HALVINGS = 16, 8  # actions on the way to the agent's own one, and halvings of what is left of the way
 
@@ -35,7 +36,7 @@ class Shield:
     r"""Lets actions through that surely keep the set, and takes near ones that do in place of the others.
 
     .. math::
-        u' = \begin{cases} u & B(d(\hat z, u)) + \eta \le 0 \\ \arg\min_{v \in V,\; B(d(\hat z, v)) + \eta \le 0}
+        u' = \begin{cases} u & B(d(\hat z, u)) + \eta \le s \\ \arg\min_{v \in V,\; B(d(\hat z, v)) + \eta \le s}
         \lVert (v - u) / u_{\max} \rVert & \text{else} \\ \pi(\hat z) & \text{where no } v \in V \text{ does, or } B(\hat z) > 0
         \end{cases}
 
@@ -47,7 +48,8 @@ class Shield:
     Args:
         agent: frozen agent with a tolerated error, so that [V] is proved.
         mode: ``"nearest"``, or ``"blend"``: V is the way to :math:`\pi(\hat z)` alone, which changes smoothly with u.
-        level: act as if the set were :math:`\{B \le s\}`, s <= 0: earlier than needed.
+        level: s <= 0: actions have to keep :math:`\{B \le s\}`, so that the filter acts before the border. A policy that is held at
+            the border of :math:`\{B \le 0\}` meets corrections that are cut again and again, and the memory goes astray.
         margin: :math:`\eta` in place of the proved one, for an agent without a proof: then nothing is guaranteed.
 
     Raises:
@@ -60,7 +62,7 @@ class Shield:
         torch.Size([4, 1])
     """
 
-    def __init__(self, agent: Agent, *, mode: str = "nearest", level: float = 0.0, margin: float | None = None) -> None:
+    def __init__(self, agent: Agent, *, mode: str = "nearest", level: float = LEVEL, margin: float | None = None) -> None:
         if mode not in MODES or not level <= 0.0 or (margin is not None and not margin >= 0.0):
             raise ConfigError(
                 f"expected mode in {MODES}, level <= 0 and margin >= 0 or None, received {mode!r}, {level} and {margin}"

@@ -80,7 +80,7 @@ class Gather(Phase):
         else:
             parts = [work.latents, self._near_the_set(work)]
             if source.known and s.rim_transitions:
-                parts.append(rim_of_unsafe(work, 20 * self.number + 10))
+                parts.append(_rim_of_unsafe(work, 20 * self.number + 10))
         parts = [work.filtered(part) for part in parts]
         work.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
         work.cache.clear()
@@ -118,29 +118,12 @@ class Gather(Phase):
 
 
 @torch.no_grad()
-def rim_of_unsafe(work: Workspace, index: int) -> dict[str, Tensor]:
+def _rim_of_unsafe(work: Workspace, index: int) -> dict[str, Tensor]:
     """Of many transitions that start in U, those whose pictures the present barrier puts lowest."""
     s, source = work.config, work.source
     drawn = source.random(s.rim_draws * s.rim_transitions, index, region=source.env.unsafe_set, steps=1)
     lowest = work.barrier(drawn["seen"])[:, 0].topk(s.rim_transitions, largest=False).indices
     return {k: v[lowest] for k, v in drawn.items()}
-
-
-class GatherRim(Phase):
-    """Transitions that start in U and look nearly safe, for what follows in the same round.
-
-    How far the level has to be lowered is decided by the few pictures of U that the barrier puts lowest.
-    Source: none; only where the environment knows its sets.
-    """
-
-    name = "rim"
-
-    def run(self, work: Workspace) -> None:
-        if work.source is None or not work.source.known or not work.config.rim_transitions:
-            return
-        rim = work.filtered(rim_of_unsafe(work, 20 * self.number + 11))
-        work.latents = {k: torch.cat([v, rim[k]]) for k, v in work.latents.items()}
-        work.cache.clear()
 
 
 class _Training(Phase):
@@ -409,7 +392,7 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
         ['gather', 'dynamics', 'teach', 'fit', 'steer', 'tune']
     """
     teach = [TeachPolicy] if config.teacher == "value" else []
-    tighten = [GatherRim, Tighten] if config.tolerated_error > 0 else []
+    tighten = [Tighten] if config.tolerated_error > 0 else []
     kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, SteerPolicy, FineTune, *tighten, *([check] if check else [])]
     return [kind(k) for k in range(config.rounds) for kind in kinds]
 
@@ -575,5 +558,5 @@ def _value_targets(work: Workspace, queries: Tensor, errors: Tensor) -> tuple[Te
 
 
 __all__ = [
-    "FineTune", "FitDynamics", "FitSets", "Gather", "GatherRim", "SteerPolicy", "TeachPolicy", "Tighten", "action_grid", "synthesis_phases",
+    "FineTune", "FitDynamics", "FitSets", "Gather", "SteerPolicy", "TeachPolicy", "Tighten", "action_grid", "synthesis_phases",
 ]

@@ -1,0 +1,218 @@
+"""The safety filter: what it lets through, what it takes instead, and that the system stays out of U behind it."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.spaces import Box
+from tensordict import TensorDict
+from tensordict.nn import TensorDictModule, TensorDictSequential
+from torch import Tensor, nn
+from torchrl.envs import Compose, InitTracker, TransformedEnv
+
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.modules import LatentDynamics, Policy
+from torchrl_sspl.modules.agent import Agent, load
+from torchrl_sspl.runtime import SafetyFilter, SafetyWrapper, Shield
+
+
+class Moves(LatentDynamics):
+    """z+ = z + u / 10."""
+
+    def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return (latent + action / 10).clamp(-1, 1)
+
+
+class Back(Policy):
+    """Pushes back with full strength."""
+
+    def forward(self, latent: Tensor) -> Tensor:
+        return -self.action_scale * latent.sign()
+
+
+def line(error: float = 0.01) -> Agent:
+    """On a line, B(z) = z - 0.5, actions of at most 1."""
+    barrier = nn.Sequential(nn.Linear(1, 1))
+    with torch.no_grad():
+        barrier[0].weight.fill_(1.0)
+        barrier[0].bias.fill_(-0.5)
+    return Agent(nn.Identity(), Moves(1, 1), barrier, Back(1, 1), 1.0, {"tolerated_error": error}, 0.5)
+
+
+def shield(**options: Any) -> Shield:
+    return Shield(line(), **{"level": 0.0, "margin": 0.02} | options)
+
+
+@pytest.mark.parametrize(
+    ("latent", "wanted", "taken"),
+    [
+        (0.0, 0.7, 0.7),  # nothing speaks against it
+        (0.45, 0.2, 0.2),  # to 0.47, inside by 0.03
+        (0.45, 1.0, 0.3),  # to 0.48 at most
+        (0.45, -1.0, -1.0),
+        (0.55, 0.3, -1.0),  # outside: the agent's own action
+        (0.0, 3.0, 1.0),  # beyond its range
+    ],
+)
+def test_what_is_taken(latent, wanted, taken):
+    found = shield()(torch.tensor([[latent]]), torch.tensor([[wanted]]))
+    assert float(found.action) == pytest.approx(taken, abs=2e-3)
+    assert bool(found.intervened) == (abs(wanted - taken) > 1e-9)
+    assert float(found.deviation) == pytest.approx(abs(wanted - taken), abs=2e-3)
+    after = latent + float(found.action) / 10
+    assert float(found.margin) == pytest.approx(0.5 - 0.02 - after, abs=1e-5)
+    assert latent > 0.5 or float(found.margin) >= 0.0
+
+
+def test_a_lower_level_acts_earlier_and_blending_goes_the_agents_way():
+    latent, wanted = torch.tensor([[0.35]]), torch.tensor([[1.0]])
+    assert float(shield()(latent, wanted).action) == 1.0
+    assert float(shield(level=-0.1)(latent, wanted).action) == pytest.approx(0.3, abs=2e-3)
+    assert float(shield(level=-0.1, mode="blend")(latent, wanted).action) == pytest.approx(0.3, abs=2e-2)
+
+
+def test_where_no_action_keeps_the_lower_level_it_is_the_agents_own():
+    assert float(shield(level=-0.3)(torch.tensor([[0.45]]), torch.tensor([[1.0]])).action) == -1.0
+
+
+def test_rows_do_not_mix():
+    g = torch.Generator().manual_seed(0)
+    latent, wanted = torch.rand(64, 1, generator=g), torch.rand(64, 1, generator=g) * 2 - 1
+    whole = shield()(latent, wanted)
+    for k in range(0, 64, 7):
+        one = shield()(latent[k : k + 1], wanted[k : k + 1])
+        assert torch.equal(one.action[0], whole.action[k])
+        assert torch.equal(one.margin[0], whole.margin[k])
+
+
+@pytest.mark.parametrize("options", [{"mode": "soft"}, {"level": 0.1}, {"margin": -0.1}, {"level": math.nan}])
+def test_options_that_are_none_are_refused(options):
+    with pytest.raises(ConfigError, match="expected mode"):
+        shield(**options)
+
+
+def test_bad_actions_are_refused():
+    with pytest.raises(ShapeError, match=r"\(2, 1\)"):
+        shield()(torch.zeros(2, 1), torch.zeros(2, 2))
+    with pytest.raises(NonFiniteError, match="protected"):
+        shield()(torch.zeros(1, 1), torch.full((1, 1), math.nan))
+
+
+def test_an_agent_without_a_proof_needs_a_margin():
+    with pytest.raises(ConfigError, match="margin"):
+        Shield(line(error=0.0))
+    assert Shield(line(error=0.0), margin=0.02).margin == 0.02
+
+
+def test_the_margin_of_a_proof_is_its_tolerated_error():
+    agent = load("pendulum")
+    made = Shield(agent)
+    least = agent.lipschitz_bound * agent.tolerated_error
+    assert least < made.margin < least + 0.01
+
+
+def test_behind_a_policy_that_pushes_the_pendulum_stays_out_of_u():
+    agent = load("pendulum")
+    env = PendulumEnv(batch_size=[32], seed=0)
+    pushes = TensorDictModule(lambda pixels: torch.full((len(pixels), 1), 10.0), ["pixels"], ["action"])
+    protect = SafetyFilter(agent)
+
+    env.initial_set = env.safe_set
+    outer = TransformedEnv(env, Compose(InitTracker(), protect.make_tensordict_primer()))
+    bare = outer.rollout(60, pushes)["next", "region"]
+    kept = outer.rollout(60, TensorDictSequential(pushes, protect))
+    assert bool((bare == 2).any(1).all())
+    assert not bool((kept["next", "region"] == 2).any())
+    assert bool(kept["intervened"].any())
+    assert kept["deviation"].shape == kept["safety_margin"].shape == (32, 60, 1)
+    changed = (kept["action"] - 10.0).abs() > 0
+    assert torch.equal(changed, kept["intervened"])
+
+
+class Gym(gymnasium.Env):
+    """The pendulum as an environment of gymnasium, its two frames in one of three layouts."""
+
+    def __init__(self, layout: str = "channels first", high: float = 10.0, size: int = 64) -> None:
+        self.inner = PendulumEnv(batch_size=[1], seed=0, image_size=size)
+        self.inner.initial_set = self.inner.safe_set
+        self.layout = layout
+        shape = {"channels first": (6, size, size), "channels last": (size, size, 6), "stacked": (2, size, size, 3)}[layout]
+        self.observation_space = Box(0, 255, shape, np.uint8)
+        self.action_space = Box(-high, high, (1,), np.float32)
+
+    def _shown(self, data: Any) -> np.ndarray:
+        pixels = data["pixels"][0]
+        if self.layout == "stacked":
+            pixels = pixels.unflatten(0, (2, 3)).permute(0, 2, 3, 1)
+        return (pixels.permute(1, 2, 0) if self.layout == "channels last" else pixels).numpy()
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        if seed is not None:
+            self.inner.set_seed(seed)
+        self.data = self.inner.reset()
+        return self._shown(self.data), {}
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        self.data = self.inner.step(self.data.set("action", torch.as_tensor(action)[None]))["next"]
+        return self._shown(self.data), 0.0, False, False, {"unsafe": bool(self.data["region"] == 2)}
+
+
+@pytest.mark.parametrize("layout", ["channels first", "channels last", "stacked"])
+def test_the_wrapper_keeps_a_policy_that_knows_nothing_of_it_out_of_u(layout):
+    env = SafetyWrapper(Gym(layout), load("pendulum"))
+    _, info = env.reset(seed=3)
+    assert set(info["safety"]) == {"barrier", "inside", "applies"}
+    assert info["safety"]["applies"]
+    for _ in range(60):
+        _, _, _, _, info = env.step(env.action_space.high)
+        assert not info["unsafe"]
+    told = info["safety"]
+    assert set(told) == {"intervened", "wanted", "taken", "deviation", "margin", "barrier", "inside", "applies"}
+    assert env.statistics["steps"] == 60
+    assert 0 < env.statistics["interventions"] <= 60
+
+
+def test_layouts_show_the_same():
+    seen = []
+    for layout in ("channels first", "channels last", "stacked"):
+        env = SafetyWrapper(Gym(layout), load("pendulum"))
+        seen.append(env.reset(seed=3)[1]["safety"]["barrier"])
+    assert seen[0] == seen[1] == seen[2]
+
+
+def test_the_wrapper_is_the_filter():
+    agent = load("pendulum")
+    wrapped, protect = SafetyWrapper(Gym(), agent), SafetyFilter(agent)
+    observation, _ = wrapped.reset(seed=5)
+    prior, begins = torch.zeros(1, 3), torch.ones(1, 1, dtype=torch.bool)
+    for _ in range(20):
+        pixels = torch.from_numpy(np.array(observation))[None]
+        batch = TensorDict(pixels=pixels, prior=prior, is_init=begins, action=torch.full((1, 1), 4.0), batch_size=[1])
+        out = protect(batch)
+        observation, _, _, _, info = wrapped.step(np.array([4.0], np.float32))
+        assert np.allclose(info["safety"]["taken"], out["action"][0].numpy(), atol=1e-5)
+        prior, begins = out["next", "prior"], torch.zeros(1, 1, dtype=torch.bool)
+
+
+@pytest.mark.parametrize(
+    ("env", "error", "words"),
+    [
+        (lambda: Gym(high=2.0), ConfigError, "RescaleAction"),
+        (lambda: Gym(size=32), ShapeError, "64"),
+        (lambda: gymnasium.make("CartPole-v1"), ConfigError, "two RGB frames"),
+    ],
+)
+def test_environments_that_do_not_fit_are_refused(env, error, words):
+    with pytest.raises(error, match=words):
+        SafetyWrapper(env(), load("pendulum"))
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    with pytest.raises(ConfigError, match="reset"):
+        SafetyWrapper(Gym(), load("pendulum")).step(np.zeros(1))
