@@ -16,6 +16,8 @@ FURTHER = {
     "walks_from_set_hit": "walks from {B <= 0} that hit the obstacle",
     "walks_from_set_fall": "walks from {B <= 0} that fall",
     "safe_rollouts_leave": "episodes from {B <= 0} that leave it",
+    "safe_rollouts_seen_outside": "... of which an observation by itself has B > 0",
+    "corrections_cut": "... steps at which a correction is cut",
     "safe_called_unsafe": "S with B > 0",
     "unsafe_rollouts_return": "recoverable starts in U that come back",
     "on_policy_step_error_q99": "latent consistency error, own steps, 99 %",
@@ -59,6 +61,13 @@ def certificate(run: Path) -> dict[str, str]:
             s = said[name]
             told = "yes" if s["value"] is None else f"{s['value']:.3g} {s['unit']}"
             rows[label] = told if s["holds"] is not False else f"no, misses by {s['misses_by'] or float('nan'):.3g}"
+    blocks = (body["record"] or {}).get("blocks", [])
+    if blocks and "tolerated error" in said and said["tolerated error"]["holds"]:
+        total = {k: sum(block[k] for block in blocks) for k in ("episodes", "exceeding", "steps", "uncovered")}
+        rows["episodes to which the proof applies from the first step to the last"] = (
+            f"{total['episodes'] - total['exceeding']:,} of {total['episodes']:,} (risk {100 * said['covered']['value']:.2g} % at most, 95 %)"
+        )
+        rows["steps at which its premise is met"] = f"{total['steps'] - total['uncovered']:,} of {total['steps']:,}"
     return rows
 
 

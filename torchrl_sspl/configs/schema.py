@@ -168,8 +168,8 @@ class SynthesisConfig:
     tube_radius: float = _option(0.3, "distance from the data up to which a latent off the manifold may belong to the "
         "safe set.")
     tolerated_error: float = _option(0.0, "error per step that the set is meant to be proved to tolerate, latent units: the "
-        "invariant set of the data keeps so much and half as much again, and after the fine-tuning the counterexamples of "
-        "the proof go back into the training. 0: residual_spread counts, and nothing is asked of the proof.")
+        "invariant set of the data keeps a quarter more, the fine-tuning asks the condition under the worst error of this size, and "
+        "then the counterexamples of the proof go back into the training. 0: residual_spread counts, and nothing is asked of the proof.")
     residuals: int = _option(16, "observed errors of the dynamics per latent that the fine-tuning adds to successors.")
     residual_spread: float = _option(1.5, 'standard deviations of the local error that the invariant set of the data '
         'tolerates; with teacher "value" lowered by quarters where nine tenths of S could not be kept otherwise.')
