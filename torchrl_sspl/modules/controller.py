@@ -60,6 +60,21 @@ class Memory:
             self.begins = self.begins.index_fill(0, rows, False)
 
 
+def meets_premise(agent: Any, barrier: Tensor, seen: Tensor, error: Tensor) -> Tensor:
+    """Whether steps meet the premise of the proof (Theorem F in ``docs/theory.md``), bool of the shape of what is given.
+
+    Args:
+        agent: gives the tolerated error, and whether corrections are held in the set.
+        barrier, seen: barrier values of the memory, and of what was seen by itself.
+        error: length of the corrections, latent units.
+
+    Source: none.
+    """
+    # A comparison with a number that is none is false.
+    met = (seen <= 0.0) & (barrier <= 0.0) & torch.tensor(agent.tolerated_error > 0.0, device=seen.device)
+    return met if agent.held_error > 0.0 else met & (error <= agent.tolerated_error)
+
+
 @dataclass
 class Step:
     """What a controller does with n observations, and what it knows about them."""
@@ -124,15 +139,9 @@ class Controller:
         latent, innovation, _ = memory.correct(seen)
         action, barrier = agent.policy(latent), agent.barrier(latent)[:, 0]
         error = (latent - (seen - innovation)).norm(dim=-1)
-        # A comparison with a number that is none is false.
-        met = (agent.barrier(seen)[:, 0] <= 0.0) & (barrier <= 0.0)
-        if not agent.held_error > 0.0:
-            met &= error <= agent.tolerated_error
-        if not agent.tolerated_error > 0.0:
-            met = torch.zeros_like(met)
-        self._applies = self._applies & met
+        self._applies = self._applies & meets_premise(agent, barrier, agent.barrier(seen)[:, 0], error)
         memory.expect(agent.dynamics(latent, action))
         return Step(action, barrier, barrier <= 0.0, innovation.norm(dim=-1), error, self._applies.clone(), latent)
 
 
-__all__ = ["Controller", "Memory", "Step"]
+__all__ = ["Controller", "Memory", "Step", "meets_premise"]

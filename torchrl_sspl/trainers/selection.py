@@ -15,6 +15,7 @@ from torchrl_sspl.evaluation.episodes import separating_level
 from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.controller import meets_premise
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.trainers.phases import Check, Phase, Workspace
@@ -47,8 +48,9 @@ class CheckRound(Phase):
     of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim,
     in the first steps, so many short episodes say more than few long ones. Where a proof is asked for, a level passes if the
     weights say that its set tolerates an error (branch and bound), the checks are made with the memory held in the set,
-    and the proof applies to enough of the episodes. An observer that believes itself more than what it sees keeps a constant innovation; a set is
-    refused where the mean innovation of an episode is larger than single ones under random actions ever are.
+    and the proof applies to enough of the episodes. An observer that believes itself more than what it sees keeps a
+    constant innovation; a set is refused where the mean innovation of an episode is larger than single ones under random
+    actions ever are.
     Source: none; the paper stops at a total loss of zero.
     """
 
@@ -100,9 +102,8 @@ class CheckRound(Phase):
     def _covered(run: Episodes, agent: Agent) -> float:
         """Share of the episodes from the set that meet the premise of the proof at every step."""
         assert run.barrier is not None
-        met = (run.seen <= 0) & (run.barrier <= 0)
-        if not agent.held_error > 0:
-            met[1:] &= run.prediction_error <= agent.tolerated_error
+        error = torch.cat([torch.zeros_like(run.prediction_error[:1]), run.prediction_error])  # nothing was expected at first
+        met = meets_premise(agent, run.barrier, run.seen, error)
         return float(met.all(0)[run.barrier[0] <= 0].float().mean())
 
     def _held_out(self, work: Workspace, agent: Agent) -> _HeldOut | None:
