@@ -7,6 +7,7 @@ import json
 import math
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,12 @@ from safetensors.torch import load_file, save_file
 
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate, Reason, weights_digest
-from torchrl_sspl.certification.record import Record
+from torchrl_sspl.certification.record import NOTHING, Record
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.evaluation import certify as certify_module
-from torchrl_sspl.evaluation.certify import Exit, certify, verify_run
+from torchrl_sspl.evaluation.blocks import Block
+from torchrl_sspl.evaluation.certify import Exit, _block_changes, certify, verify_run
 from torchrl_sspl.modules.agent import Agent
 
 
@@ -487,3 +489,25 @@ def test_what_breaks_while_it_is_checked_ends_without_a_traceback(issued, tmp_pa
 
     code, text = verify(copied(issued, tmp_path), env=Line(law=broken))
     assert (code, "shapes do not fit" in text) == (Exit.AGENT, True), text
+
+
+@pytest.mark.parametrize(
+    ("change", "refused"),
+    [
+        ({}, False),
+        ({"steps": -1, "uncovered": -1}, False),  # an episode that ended a step earlier on another machine
+        ({"steps": 2}, False),
+        ({"steps": 3}, True),
+        ({"steps": -3, "uncovered": -3}, True),
+        ({"uncovered": -2}, True),
+        ({"steps": 2, "uncovered": -2}, True),
+    ],
+)
+def test_a_step_may_be_rounded_away_only_where_episodes_end_early(change, refused):
+    found = replace(NOTHING, episodes=3, steps=700, uncovered=700, exceeding=3, events=0)
+    steps, none = torch.tensor([200, 100, 400]), torch.zeros(0)
+    block = Block(found, found, 0, none, steps, [], [], {}, none, none, none, none, none)
+    claimed = replace(found, **{k: getattr(found, k) + v for k, v in change.items()})
+    assert bool(_block_changes(claimed, block, resets=False)) is refused
+    whole = replace(block, steps=torch.full((3,), 400))
+    assert bool(_block_changes(claimed, whole, resets=False)) is bool(change)
