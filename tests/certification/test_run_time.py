@@ -15,7 +15,9 @@ from safetensors.torch import load_file, save_file
 from torch import nn
 
 from torchrl_sspl.certification.conditions import closed_loop, largest_error, tolerates
+from torchrl_sspl.evaluation.blocks import counted, holds_at
 from torchrl_sspl.evaluation.certify import Exit, certify
+from torchrl_sspl.evaluation.simulation import Episodes
 from torchrl_sspl.modules.observer import gain_matrix
 
 
@@ -89,6 +91,28 @@ def test_a_broken_twin_is_refused(name, observed, tmp_path):
     code, text = verify(path)
     assert code in (Exit.REFUSED, Exit.MALFORMED, Exit.AGENT), text
     assert reason in text
+
+
+def test_steps_are_covered_where_memory_and_observation_lie_in_the_set():
+    """Three episodes of two steps: covered; the memory leaves, which an error cannot excuse; a picture lies outside."""
+    barrier = torch.tensor([[-1.0, -1.0, -1.0], [-1.0, 0.5, -1.0], [-1.0, -1.0, -1.0]])
+    seen = torch.tensor([[-1.0, -1.0, -1.0], [-1.0, -1.0, -1.0], [-1.0, -1.0, 0.5]])
+    none, error = torch.zeros(3, 3, 1), torch.full((2, 3), 5.0)
+    run = Episodes(
+        latent=none, region=torch.zeros(3, 3, dtype=torch.int64), alive=torch.ones(3, 3, dtype=torch.bool),
+        prediction_error=error, barrier=barrier, seen=seen, innovation=none, actions=torch.zeros(2, 3, 1),
+    )  # fmt: skip
+    found = counted(run, 0.0, 0.1, held=True)[0]
+    assert (found["exceeding"], found["uncovered"]) == (2, 2)
+    assert counted(run, 0.0, 0.1)[0]["uncovered"] == 6  # without a memory that is held, the error counts
+
+
+def test_corrections_are_held_at_level_zero():
+    agent = line_agent(tolerated_error=0.1)
+    assert not holds_at(agent, 0.0)
+    agent.gain = gain_matrix(0.5, 2)
+    assert holds_at(agent, 0.0)
+    assert not holds_at(agent, -0.1)
 
 
 def test_a_monitor_beyond_the_proof_is_not_certified():

@@ -19,7 +19,7 @@ from torchrl_sspl.evaluation.controllers import AgentController
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
 from torchrl_sspl.modules.agent import Agent, load, mlp_barrier
-from torchrl_sspl.modules.controller import Memory
+from torchrl_sspl.modules.controller import Memory, meets_premise
 from torchrl_sspl.modules.observer import corrected, filtered, gain_matrix, held
 
 
@@ -170,6 +170,13 @@ def watched(latents: list[float], *, error: float = 0.11, gain: float = 0.5) -> 
 )
 def test_the_premise_is_watched_and_never_met_again_once_it_was_not(latents, applies):
     assert watched(latents) == applies
+
+
+def test_memory_and_observation_both_have_to_lie_in_the_set():
+    inside, outside, none = torch.tensor([-0.1]), torch.tensor([0.1]), torch.zeros(1)
+    agent = small_agent(error=0.01)
+    met = [bool(meets_premise(agent, *pair, none)) for pair in ((inside, inside), (outside, inside), (inside, outside))]
+    assert met == [True, False, False]
 
 
 def test_without_a_memory_no_correction_may_be_larger_than_what_is_tolerated():

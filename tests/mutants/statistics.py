@@ -11,6 +11,7 @@ _FILES = "tests/certification/test_malformed.py"
 MALFORMED = f"{_FILES}::test_a_malformed_file_is_no_certificate"
 NESTED = f"{_FILES}::test_nesting_is_refused_before_anything_is_parsed"
 CLAIMS = f"{FORGED}::test_a_forgery_with_a_fitting_digest_is_refused"
+EARLY = f"{FORGED}::test_a_step_may_be_rounded_away_only_where_episodes_end_early"
 STEPS = f"{LOOPS}::test_events_are_those_of_every_single_step"
 
 #: (file, old text, new text, tests[, why it survives])
@@ -127,8 +128,12 @@ MUTANTS = [
     (CERTIFY, "if missing or (named is not None and record is None):", "if missing and False:", CLAIMS),
     (CERTIFY, "    _refuse(found)\n    budget", "    budget", CLAIMS),
     (CERTIFY, "    _refuse(found)\n    left", "    left", CLAIMS),
-    (CERTIFY, "getattr(claimed, k) < max(least[k], found[k] - 1)]", "getattr(claimed, k) < found[k] - 10**6]", f"{FORGED}::test_one_lowered_count_is_found_where_its_block_is_measured"),
+    (CERTIFY, "max(least[k], found[k] - 1) - fewer.get(k, 0)]", "found[k] - 10**6]", f"{FORGED}::test_one_lowered_count_is_found_where_its_block_is_measured"),
     (CERTIFY, "max(least[k], found[k] - 1)", "least[k]", f"{FORGED}::test_a_barrier_that_hovers_hides_no_events"),
+    (CERTIFY, " - fewer.get(k, 0)]", "]", EARLY),
+    (CERTIFY, "max(found[\"steps\"] - claimed.steps, 0)", "abs(found[\"steps\"] - claimed.steps)", EARLY),
+    (CERTIFY, ".sum()) / _LATE)", ".sum()) / 2)", EARLY),
+    (CERTIFY, "block.steps[block.steps < longest]", "block.steps", EARLY),
     (CERTIFY, "if abs(getattr(claimed, k) - found[k]) > most]", "if abs(getattr(claimed, k) - found[k]) > 10**9]", CLAIMS),
     (CERTIFY, "not math.isclose(number, other, rel_tol=1e-2, abs_tol=1e-6)", "False", CLAIMS),
     (CERTIFY, "abs(a[1] - b[1]) > close * claimed.horizon + max(3, b[1] // 100)", "False", CLAIMS),

@@ -36,6 +36,17 @@ class Back(Policy):
         return -self.action_scale * latent.sign()
 
 
+class Shown(nn.Module):
+    """Latents with these first entries, one after the other, whatever is seen."""
+
+    def __init__(self, first: list[float]) -> None:
+        super().__init__()
+        self.first = iter(first)
+
+    def forward(self, pixels: Tensor) -> Tensor:
+        return torch.tensor([[next(self.first), 0.0, 0.0]])
+
+
 def line(error: float = 0.01) -> Agent:
     """On a line, B(z) = z - 0.5, actions of at most 1."""
     barrier = nn.Sequential(nn.Linear(1, 1))
@@ -57,6 +68,7 @@ def shield(**options: Any) -> Shield:
         (0.45, 1.0, 0.3),  # to 0.48 at most
         (0.45, -1.0, -1.0),
         (0.55, 0.3, -1.0),  # outside: the agent's own action
+        (0.55, -0.9, -1.0),  # also where the other one leads back
         (0.0, 3.0, 1.0),  # beyond its range
     ],
 )
@@ -198,6 +210,28 @@ def test_the_wrapper_is_the_filter():
         observation, _, _, _, info = wrapped.step(np.array([4.0], np.float32))
         assert np.allclose(info["safety"]["taken"], out["action"][0].numpy(), atol=1e-5)
         prior, begins = out["next", "prior"], torch.zeros(1, 1, dtype=torch.bool)
+
+
+def test_the_memory_of_the_filter_is_held_in_the_set():
+    agent = line()
+    begins, seen = torch.zeros(1, 1, dtype=torch.bool), torch.tensor([[0.9]])
+    batch = TensorDict(pixels=seen, prior=torch.tensor([[0.45]]), is_init=begins, action=torch.zeros(1, 1), batch_size=[1])
+    assert float(SafetyFilter(agent, margin=0.02)(batch)["latent"]) == pytest.approx(0.46)
+
+
+def test_the_wrapper_says_when_the_proof_no_longer_applies():
+    wrapped = SafetyWrapper(Gym(), load("pendulum"))
+    wrapped.agent.encoder = Shown([-1.0, 0.0, -1.0, -1.0])
+    wrapped.agent.barrier = nn.Sequential(nn.Linear(3, 1))
+    with torch.no_grad():
+        wrapped.agent.barrier[0].weight.zero_()[0, 0] = 1.0
+        wrapped.agent.barrier[0].bias.fill_(0.5)
+    told = [wrapped.reset(seed=0)[1]["safety"]]
+    told += [wrapped.step(np.zeros(1, np.float32))[4]["safety"] for _ in range(2)]
+    # The memory stays in the set, but one picture did not lie there.
+    assert [t["inside"] for t in told] == [True, True, True]
+    assert [t["applies"] for t in told] == [True, False, False]
+    assert wrapped.reset(seed=0)[1]["safety"]["applies"]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,48 @@
+"""Changes to what runs beside the robot: observer, held corrections, premise, filter, wrapper."""
+
+OBSERVER, CONTROLLER = "torchrl_sspl/modules/observer.py", "torchrl_sspl/modules/controller.py"
+FILTER, WRAPPER, BLOCKS = "torchrl_sspl/runtime/filter.py", "torchrl_sspl/runtime/wrapper.py", "torchrl_sspl/evaluation/blocks.py"
+OBSERVED, FILTERED, RUN_TIME = "tests/modules/test_observer.py", "tests/runtime/test_filter.py", "tests/certification/test_run_time.py"
+
+MUTANTS = [
+    (OBSERVER, "left > 1.0 + 1e-6", "left > 2.0", OBSERVED),
+    (OBSERVER, "or not bool(matrix.any())", "", OBSERVED),
+    (OBSERVER, "(seen - innovation @ left.mT)", "(seen - innovation @ left)", OBSERVED),
+    (OBSERVER, "innovation = seen - prior", "innovation = prior - seen", OBSERVED),
+    (OBSERVER, "(barrier(prior) <= 0.0) & (barrier(latent) > 0.0)", "(barrier(latent) > 0.0)", OBSERVED),
+    (OBSERVER, "(barrier(prior) <= 0.0) & (barrier(latent) > 0.0)", "(barrier(prior) <= 0.0)", OBSERVED),
+    (OBSERVER, "moved * (error / length)", "moved", OBSERVED),
+    (OBSERVER, "moved * (error / length)", "moved * (1.1 * error / length)", OBSERVED),
+    (OBSERVER, "expected = torch.where(begins, seen, prior)", "expected = prior", OBSERVED),
+    (OBSERVER, "held(self.barrier, expected, latent, self.error)[0]", "latent", OBSERVED),
+    (OBSERVER, "latent[rows] = after[rows - 1]", "pass", OBSERVED),
+    (CONTROLLER, "self.begins[rows] = True", "self.begins[:] = True", OBSERVED),
+    (CONTROLLER, "self.begins[rows] = True", "pass", OBSERVED),
+    (CONTROLLER, "held(agent.barrier, expected, latent, agent.held_error)", "held(agent.barrier, expected, latent, 0.0)", OBSERVED),
+    (CONTROLLER, "(seen <= 0.0) & (barrier <= 0.0)", "(seen <= 0.0)", OBSERVED),
+    (CONTROLLER, "(seen <= 0.0) & (barrier <= 0.0)", "(barrier <= 0.0)", OBSERVED),
+    (CONTROLLER, "torch.tensor(agent.tolerated_error > 0.0, device=seen.device)", "torch.tensor(True, device=seen.device)", OBSERVED),
+    (CONTROLLER, "met & (error <= agent.tolerated_error)", "met", OBSERVED),
+    (CONTROLLER, "self._applies = self._applies & meets_premise", "self._applies = meets_premise", OBSERVED),
+    (CONTROLLER, "memory.expect(agent.dynamics(latent, action))", "memory.expect(latent)", OBSERVED),
+    (BLOCKS, "(barrier[1:] <= level + margin) if held else", "(barrier[1:] > -9e9) if held else", RUN_TIME),
+    (BLOCKS, "met = met & (seen[1:] <= level + margin)", "met = met", RUN_TIME),
+    (BLOCKS, "return agent.held_error > 0.0 and level == 0.0", "return False", RUN_TIME),
+    (FILTER, "not level <= 0.0", "False", FILTERED),
+    (FILTER, "margin is None and not agent.tolerated_error > 0.0", "False", FILTERED),
+    (FILTER, "self.level - self.margin - self.agent", "self.level - self.agent", FILTERED),
+    (FILTER, "self.level - self.margin - self.agent", "-self.margin - self.agent", FILTERED),
+    (FILTER, "inside & (self._margin(latent, asked) >= 0.0)", "self._margin(latent, asked) >= 0.0", FILTERED),
+    (FILTER, "asked = wanted.clamp(-scale, scale)", "asked = wanted", FILTERED),
+    (FILTER, ".masked_fill(~keeps, float(\"inf\"))", "", FILTERED),
+    (FILTER, "torch.where(found, torch.where(kept < 1.0, torch.lerp(asked, best, kept), best), own)", "torch.where(kept < 1.0, torch.lerp(asked, best, kept), best)", FILTERED),
+    (FILTER, "torch.where(good, middle, kept), torch.where(good, lost, middle)", "torch.where(good, lost, middle), torch.where(good, middle, kept)", FILTERED),
+    (FILTER, "agent.lipschitz_bound * agent.tolerated_error + 2.0 * rounding", "2.0 * rounding", FILTERED),
+    (FILTER, "after = self.agent.dynamics(rows, made.action)", "after = self.agent.dynamics(rows, wanted.reshape(-1, wanted.shape[-1]))", FILTERED),
+    (FILTER, "latent_dim, agent.barrier, agent.held_error)", "latent_dim)", FILTERED),
+    (WRAPPER, "        self._memory.forget()\n", "", FILTERED),
+    (WRAPPER, "self.agent.dynamics(self._latent, made.action)", "self.agent.dynamics(self._latent, wanted)", FILTERED),
+    (WRAPPER, "and float(agent.barrier(seen)) <= 0.0", "", FILTERED),
+    (WRAPPER, "self._applies &= agent", "self._applies = agent", FILTERED),
+    (WRAPPER, "pixels.permute(0, 3, 1, 2).flatten(0, 1)", "pixels.permute(3, 0, 1, 2).flatten(0, 1)", FILTERED),
+]  # fmt: skip
