@@ -164,6 +164,12 @@ class Agent(nn.Module):
         """
         return Controller(self, batch_size)
 
+    def export(self, path: str | Path, **options: Any) -> Path:
+        """Write one step for a machine without this library; see :func:`torchrl_sspl.runtime.export`."""
+        from torchrl_sspl.runtime.export import export
+
+        return export(self, path, **options)
+
     @property
     def tolerated_error(self) -> float:
         """Error per step, latent units, up to which the proof applies at run time; 0 where nothing is proved."""

@@ -71,8 +71,9 @@ class ColourMoments(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Whitened centres ``(n, kept)`` of frames ``(n, c, H, W)``."""
-        # A few frames at a time stay in the cache.
-        centre = torch.cat([self.centres(part) for part in frames.split(32)])
+        # A few frames at a time stay in the cache; an exported graph has no loop.
+        parts = [frames] if torch.compiler.is_exporting() else frames.split(32)
+        centre = torch.cat([self.centres(part) for part in parts])
         return (centre - self.mean) @ self.whitening
 
 

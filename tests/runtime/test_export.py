@@ -1,0 +1,99 @@
+"""Exported agents compute what the library computes, in a process without torch, too."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import CertificationError, ConfigError
+from torchrl_sspl.modules.agent import load
+from torchrl_sspl.runtime import DeployedStep
+from torchrl_sspl.runtime import export as exporting
+from torchrl_sspl.runtime.export import INPUTS, OUTPUTS, _steps
+
+DEPLOY = Path(__file__).resolve().parents[2] / "examples" / "deploy"
+
+
+@pytest.fixture(scope="module")
+def onnx_file(tmp_path_factory) -> Path:
+    return load("pendulum").export(tmp_path_factory.mktemp("onnx") / "pendulum.onnx", check=16)
+
+
+def test_steps_are_those_of_the_controller():
+    agent, env = load("pendulum"), PendulumEnv(batch_size=[8], seed=3)
+    step, controller = DeployedStep(agent), agent.controller(8)
+    latent, action, begins = torch.zeros(8, 3), torch.zeros(8, 1), torch.ones(8, dtype=torch.bool)
+    applies = torch.ones(8, dtype=torch.bool)
+    data = env.reset()
+    with torch.no_grad():
+        for _ in range(15):
+            out = controller.step(data["pixels"])
+            action, barrier, _, innovation, met, latent = step(data["pixels"], latent, action, begins)
+            begins, applies = torch.zeros(8, dtype=torch.bool), applies & met
+            assert torch.equal(action, out.action)
+            assert torch.equal(barrier, out.barrier)
+            assert torch.allclose(innovation, out.innovation)
+            assert torch.equal(applies, out.applies)
+            data = env.step(data.set("action", action))["next"].exclude("reward")
+
+
+@pytest.mark.parametrize("n", [1, 500])
+def test_onnx_computes_the_same_for_any_batch(onnx_file, n):
+    onnxruntime = pytest.importorskip("onnxruntime")
+    agent = load("pendulum")
+    given = _steps(agent, n, 7)
+    with torch.no_grad():
+        wanted = dict(zip(OUTPUTS, DeployedStep(agent)(**given), strict=True))
+    session = onnxruntime.InferenceSession(str(onnx_file), providers=["CPUExecutionProvider"])
+    assert tuple(i.name for i in session.get_inputs()) == INPUTS
+    found = dict(zip(OUTPUTS, session.run(None, {k: v.numpy() for k, v in given.items()}), strict=True))
+    assert np.abs(found["next_action"] - wanted["next_action"].numpy()).max() <= 1e-4 * 20
+    assert np.abs(found["barrier"] - wanted["barrier"].numpy()).max() <= 1e-4
+    assert np.mean(found["met"] == wanted["met"].numpy()) > 0.99  # those that are close may be rounded
+
+
+def test_a_process_without_torch_runs_a_film(onnx_file, tmp_path):
+    iio = pytest.importorskip("imageio.v3")
+    env = PendulumEnv(batch_size=[1], seed=1)
+    data, shown = env.reset(), []
+    for _ in range(6):
+        shown.append(data["pixels"][0, 3:].permute(1, 2, 0).numpy())
+        data = env.step(data.set("action", env.action_spec.zero()))["next"].exclude("reward")
+    iio.imwrite(tmp_path / "film.gif", np.stack(shown), duration=50, loop=0)
+    run = f"import sys; sys.modules['torch'] = None; sys.argv = ['x', r'{onnx_file}', r'{tmp_path / 'film.gif'}']; " \
+        f"import runpy; runpy.run_path(r'{DEPLOY / 'run_onnx.py'}', run_name='__main__')"  # fmt: skip
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    assert "waiting" in lines[0]
+    assert all("B = " in line and ("proof applies" in line or "premise" in line or "outside" in line) for line in lines[1:])
+
+
+def test_the_file_says_what_it_is(onnx_file):
+    onnx = pytest.importorskip("onnx")
+    about = {p.key: json.loads(p.value) for p in onnx.load(onnx_file).metadata_props}
+    assert about["pixels"] == [6, 64, 64]
+    assert about["action_scale"] == [10.0]
+    assert about["tolerated_error"] == load("pendulum").tolerated_error
+
+
+def test_programmes_of_torch_are_checked_too(tmp_path, monkeypatch):
+    agent = load("pendulum")
+    assert agent.export(tmp_path / "deep" / "agent.pt2", check=8).is_file()
+    other = load("pendulum")
+    with torch.no_grad():
+        other.policy.action_scale.mul_(1.01)
+    with pytest.raises(CertificationError, match="exported"):
+        exporting.__globals__["_compare"](DeployedStep(other), tmp_path / "deep" / "agent.pt2", 8)
+
+
+def test_another_suffix_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match=r"\.onnx or \.pt2"):
+        load("pendulum").export(tmp_path / "agent.pth")

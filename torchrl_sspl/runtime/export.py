@@ -1,0 +1,168 @@
+r"""One step of an agent as a file that runs without this library: ONNX, or a programme of ``torch.export``."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sspl.errors import CertificationError, ConfigError, MissingDependencyError
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.controller import meets_premise
+from torchrl_sspl.modules.observer import corrected, held
+
+INPUTS = ("pixels", "latent", "action", "begins")
+OUTPUTS = ("next_action", "barrier", "seen_barrier", "innovation", "met", "next_latent")
+_SIZE = 64  # of the pictures of an encoder that takes any size
+_TOLERANCE = 1e-4  # of action and barrier, each relative to its range
+
+
+class DeployedStep(nn.Module):
+    r"""An agent's step as a function without a memory of its own; what it has to remember goes in and comes out.
+
+    .. math:: (o_t, \hat z_{t-1}, u_{t-1}, \text{begins}) \mapsto
+        (u_t, B(\hat z_t), B(E(o_t)), \lVert i_t \rVert, \text{met}, \hat z_t)
+
+    The action that goes in is the one that was really taken, in physical units; with ``begins`` neither it nor the latent
+    counts. ``met`` says whether this step meets the premise of the proof; the proof applies as long as every step since the
+    beginning did (Theorem F in ``docs/theory.md``). Source: none.
+
+    Args:
+        agent: frozen agent.
+
+    Example:
+        >>> from torchrl_sspl.modules.agent import load
+        >>> step = DeployedStep(load("pendulum"))
+        >>> frames, begins = torch.zeros(2, 6, 64, 64, dtype=torch.uint8), torch.ones(2, dtype=torch.bool)
+        >>> [tuple(t.shape) for t in step(frames, torch.zeros(2, 3), torch.zeros(2, 1), begins)]
+        [(2, 1), (2,), (2,), (2,), (2,), (2, 3)]
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        super().__init__()
+        self.agent = agent
+        # As numbers: nothing may be decided by tensors where a graph is traced.
+        self.proved = SimpleNamespace(tolerated_error=agent.tolerated_error, held_error=agent.held_error)
+
+    def forward(self, pixels: Tensor, latent: Tensor, action: Tensor, begins: Tensor) -> tuple[Tensor, ...]:
+        """The step, for pixels ``(n, 6, H, W)`` uint8, latent ``(n, p)``, action ``(n, m)`` and begins ``(n,)`` bool."""
+        agent = self.agent
+        seen = agent.encoder(pixels)
+        prior = torch.where(begins[:, None], seen, agent.dynamics(latent, action))
+        now, innovation = corrected(prior, seen, agent.gain)
+        now, _ = held(agent.barrier, prior, now, self.proved.held_error)
+        barrier, of_seen = agent.barrier(now)[:, 0], agent.barrier(seen)[:, 0]
+        met = meets_premise(self.proved, barrier, of_seen, (now - prior).norm(dim=-1))
+        return agent.policy(now), barrier, of_seen, innovation.norm(dim=-1), met, now
+
+
+def export(agent: Agent, path: str | Path, *, check: int = 256) -> Path:
+    """Writes one step of an agent, :class:`DeployedStep`, for a machine without this library.
+
+    The suffix says what: ``.onnx`` for onnxruntime and the like, ``.pt2`` for ``torch.export.load``. The batch is dynamic. An ONNX
+    file carries the agent's sizes, its digest and its tolerated error as metadata.
+
+    Args:
+        agent: frozen agent.
+        path: file to write; its folder is created if necessary.
+        check: number of random steps on which the file is compared with the agent before this returns; 0: none.
+
+    Returns the path. Raises ConfigError for another suffix; MissingDependencyError without the packages of the extra
+    ``onnx``; CertificationError if the file computes something else. Source: none.
+
+    Example:
+        >>> from tempfile import mkdtemp
+        >>> from torchrl_sspl.modules.agent import load
+        >>> export(load("pendulum"), Path(mkdtemp()) / "agent.pt2").name
+        'agent.pt2'
+    """
+    path = Path(path)
+    if path.suffix not in (".onnx", ".pt2"):
+        raise ConfigError(f"expected a file that ends in .onnx or .pt2, received '{path.name}'")
+    if path.suffix == ".onnx":
+        _required("onnxscript")
+    step = DeployedStep(agent).cpu().eval()
+    dynamic = {name: {0: torch.export.Dim("n")} for name in INPUTS}
+    example = tuple(_steps(agent, 2, 0).values())
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with torch.no_grad(), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of the exporters, about themselves
+        program = torch.export.export(step, example, dynamic_shapes=dynamic)
+        if path.suffix == ".pt2":
+            torch.export.save(program, path)
+        else:
+            made: Any = torch.onnx.export(program, dynamo=True, input_names=list(INPUTS), output_names=list(OUTPUTS), verbose=False)
+            made.model.metadata_props.update({k: json.dumps(v) for k, v in _about(agent).items()})
+            made.save(path)
+    if check:
+        _compare(step, path, check)
+    return path
+
+
+def _required(package: str) -> Any:
+    try:
+        return __import__(package)
+    except ImportError as error:
+        raise MissingDependencyError(
+            f"writing and checking ONNX needs the package {package}: pip install 'torchrl-sspl[onnx]'; a .pt2 file needs nothing more"
+        ) from error
+
+
+def _about(agent: Agent) -> dict[str, Any]:
+    """What a machine that runs the file has to know."""
+    from torchrl_sspl.certification.certificate import weights_digest
+
+    return {
+        "pixels": list(_picture(agent)), "latent_dim": agent.latent_dim, "tolerated_error": agent.tolerated_error,
+        "action_scale": agent.policy.action_scale.flatten().tolist(), "weights": weights_digest(agent.state_dict()),  # type: ignore[operator, union-attr]
+    }  # fmt: skip
+
+
+def _picture(agent: Agent) -> tuple[int, int, int]:
+    size = getattr(agent.encoder, "image_size", None) or (_SIZE, _SIZE)
+    return 6, int(size[0]), int(size[1])
+
+
+def _steps(agent: Agent, n: int, seed: int) -> dict[str, Tensor]:
+    """Random steps, by the name of the input."""
+    g = torch.Generator().manual_seed(seed)
+    scale = agent.policy.action_scale.flatten().cpu()  # type: ignore[operator, union-attr]
+    return {
+        "pixels": torch.randint(256, (n, *_picture(agent)), generator=g, dtype=torch.uint8),
+        "latent": torch.rand(n, agent.latent_dim, generator=g) * 2 - 1,
+        "action": (torch.rand(n, len(scale), generator=g) * 2 - 1) * scale,
+        "begins": torch.rand(n, generator=g) < 0.5,
+    }
+
+
+@torch.no_grad()
+def _compare(step: DeployedStep, path: Path, n: int) -> None:
+    """A CertificationError if the file does not compute what the agent does."""
+    given = _steps(step.agent, n, 1)
+    wanted = dict(zip(OUTPUTS, step(**given), strict=True))
+    if path.suffix == ".pt2":
+        found = dict(zip(OUTPUTS, torch.export.load(path).module()(*given.values()), strict=True))
+    else:
+        runtime = _required("onnxruntime")
+        session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
+        made = session.run(list(OUTPUTS), {k: v.numpy() for k, v in given.items()})
+        found = {k: torch.from_numpy(v) for k, v in zip(OUTPUTS, made, strict=True)}
+    scale = step.agent.policy.action_scale.flatten().cpu()  # type: ignore[operator, union-attr]
+    spread = float(wanted["barrier"].max() - wanted["barrier"].min())
+    off = {
+        "action": float(((found["next_action"] - wanted["next_action"]) / (2 * scale)).abs().max()),
+        "barrier": float((found["barrier"] - wanted["barrier"]).abs().max()) / max(spread, 1e-6),
+    }
+    if not all(v <= _TOLERANCE for v in off.values()):
+        raise CertificationError(
+            f"expected the exported file to compute what the agent computes, to {_TOLERANCE:g} of its range, received differences of "
+            f"{off}; export with another version of torch or onnxscript"
+        )
+
+
+__all__ = ["DeployedStep", "export"]
