@@ -49,6 +49,8 @@ _NAMES = {
     "Certificate": "certification.certificate",
     "SafetyFilter": "runtime",
     "SafetyWrapper": "runtime",
+    "Monitor": "runtime",
+    "calibrate": "runtime",
 }
 
 __all__ = ["__version__", *_NAMES, *_SUBPACKAGES]

@@ -24,6 +24,7 @@ PURPOSES = {
     "certificate actions": 11,  # random actions among them
     "report": 12,  # figures and films
     "benchmark": 13,
+    "monitor": 14,  # clean episodes by which the monitor is calibrated
 }
 _INDICES = 1 << 24
 _MASK = 0xFFFF_FFFF

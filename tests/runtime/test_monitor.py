@@ -1,0 +1,182 @@
+"""The monitor: verdicts, alarms, and what is done during one."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.evaluation import simulate
+from torchrl_sspl.modules.agent import load
+from torchrl_sspl.runtime import Calibration, CameraFault, Monitor, Verdict, calibrate
+from torchrl_sspl.runtime.faults import FAULTS
+from torchrl_sspl.runtime.monitor import SIGNALS, Watching, starts
+
+NOISE = 1.0
+UPRIGHT = torch.tensor([[0.05, 0.0]])
+
+
+def shown(n: int = 1, steps: int = 1) -> list[Tensor]:
+    """Pictures of a pendulum near upright, with the noise of a camera, under no torque."""
+    env, camera = PendulumEnv(batch_size=[1], seed=0), CameraFault("dark", 1.0, noise=NOISE)
+    state = UPRIGHT.expand(n, 2)
+    before, found = env.previous_state(state), []
+    for t in range(steps):
+        found.append(camera(torch.cat([env.draw(before), env.draw(state)], 1), t))
+        before, state = state, env.wrap(env.dynamics(state, torch.zeros(n, 1)))
+    return found
+
+
+def names(verdict: Tensor) -> list[str]:
+    return [Verdict(int(v)).name for v in verdict]
+
+
+def test_what_is_known_is_where_the_proof_applies():
+    monitor = Monitor.load("pendulum")
+    out = monitor.step(shown()[0])
+    assert names(out.verdict) == ["PROOF_APPLIES"]
+    assert out.reasons == [[]]
+    assert not bool(out.alarm)
+    assert math.isnan(float(out.signals["innovation"]))  # nothing was expected yet
+    far = PendulumEnv(batch_size=[1], seed=0)
+    camera, state = CameraFault("dark", 1.0, noise=NOISE), torch.tensor([[2.0, 0.0]])
+    monitor.reset()
+    out = monitor.step(camera(torch.cat([far.draw(state), far.draw(state)], 1), 0))
+    assert names(out.verdict) == ["OUTSIDE"]
+
+
+def test_the_actions_are_the_agents_own():
+    monitor, controller = Monitor.load("pendulum", batch_size=3), load("pendulum").controller(3)
+    for pixels in shown(3, 4):
+        assert torch.equal(monitor.step(pixels).action, controller.step(pixels).action)
+
+
+@pytest.mark.parametrize("fault", ["dark", "bright", "colour", "noise", "salt", "shifted", "covered", "crossed", "doubled", "frozen"])
+def test_severe_faults_are_alarms_within_three_steps(fault):
+    pictures, camera = shown(2, 12), CameraFault(fault, FAULTS[fault][2], onset=6, noise=0.0)
+    monitor = Monitor.load("pendulum", batch_size=2)
+    alarms = [monitor.step(camera(p, t)).alarm for t, p in enumerate(pictures)]
+    assert not bool(torch.stack(alarms[:6]).any())
+    assert bool(torch.stack(alarms[6:9]).any(0).all())
+
+
+def test_rows_have_alarms_and_resets_of_their_own():
+    monitor = Monitor.load("pendulum", batch_size=2)
+    good = shown(2)[0]
+    black = good.clone()
+    black[1] = 0
+    assert names(monitor.step(black).verdict) == ["PROOF_APPLIES", "UNKNOWN_PICTURE"]
+    monitor.reset(torch.tensor([1]))
+    assert names(monitor.step(shown(2, 2)[1]).verdict)[1] == "PROOF_APPLIES"
+
+
+def test_an_alarm_ends_after_clean_steps_and_the_proof_does_not_come_back():
+    monitor = Monitor.load("pendulum", clear_after=3, signals=("place",))
+    pictures = shown(1, 8)
+    pictures[2] = torch.zeros_like(pictures[2])
+    found = [names(monitor.step(p).verdict)[0] for p in pictures]
+    assert found[:2] == ["PROOF_APPLIES"] * 2
+    assert found[2:5] == ["UNKNOWN_PICTURE"] * 3
+    assert "PROOF_APPLIES" not in found[5:]
+
+
+def test_fallbacks_act_during_an_alarm_only():
+    black = torch.zeros(1, 6, 64, 64, dtype=torch.uint8)
+    assert float(Monitor.load("pendulum", fallback="stop").step(black).action) == 0.0
+    assert float(Monitor.load("pendulum", fallback=lambda told: torch.full_like(told.action, 3.0)).step(black).action) == 3.0
+    monitor = Monitor.load("pendulum", fallback=lambda told: torch.full_like(told.action, 3.0))
+    assert float(monitor.step(shown()[0]).action) != 3.0
+    with pytest.raises(ShapeError, match="fallback"):
+        Monitor.load("pendulum", fallback=lambda told: torch.zeros(3)).step(black)
+
+
+@pytest.mark.parametrize(
+    ("pixels", "reason"),
+    [
+        (None, "missing"),
+        (torch.full((1, 6, 64, 64), math.nan), "kind"),
+        (torch.zeros(1, 6, 32, 32, dtype=torch.uint8), "size"),
+        (torch.zeros(1, 3, 64, 64, dtype=torch.uint8), "size"),
+    ],
+)
+def test_what_is_no_picture_is_an_alarm_and_the_memory_goes_on(pixels, reason):
+    monitor = Monitor.load("pendulum")
+    first, second = shown(1, 2)
+    monitor.step(first)
+    out = monitor.step(pixels)
+    assert out.reasons == [[reason]]
+    assert names(out.verdict) == ["UNKNOWN_PICTURE"]
+    assert bool(out.action.isfinite().all())
+    expected = monitor.agent.dynamics(out.latent, out.action)
+    assert torch.equal(monitor._memory.prior, expected)
+    assert bool(monitor.step(second).action.isfinite().all())
+    assert Monitor.load("pendulum").step(pixels).reasons == [[reason]]  # as the first thing that is seen
+
+
+def test_times_that_do_not_fit_are_alarms():
+    monitor = Monitor.load("pendulum", period=0.05)
+    found = [bool(monitor.step(p, time=t).alarm) for p, t in zip(shown(1, 4), (0.0, 0.05, 0.1, 0.2), strict=True)]
+    assert found == [False, False, False, True]
+    assert monitor.step(shown(1, 5)[4], time=math.nan).reasons[0][-1:] == ["time"]
+
+
+@pytest.mark.parametrize("options", [{"fallback": "run"}, {"clear_after": 0}, {"period": 0.0}, {"signals": ("smell",)}, {"batch_size": 0}])
+def test_options_that_are_none_are_refused(options):
+    with pytest.raises(ConfigError, match="expected"):
+        Monitor.load("pendulum", **options)
+
+
+def test_another_number_of_pictures_is_refused():
+    with pytest.raises(ShapeError, match="2 systems"):
+        Monitor.load("pendulum", batch_size=2).step(shown(3)[0])
+
+
+def test_a_calibration_belongs_to_one_agent(tmp_path):
+    agent = load("pendulum")
+    with pytest.raises(CheckpointError, match="calibrate"):
+        Calibration.load(agent.save(tmp_path), agent)
+    Calibration.load("pendulum", agent).save(tmp_path)
+    assert set(Calibration.load(tmp_path, agent).limits) == set(SIGNALS)
+    agent.barrier[-1].bias.data.add_(0.1)
+    with pytest.raises(CheckpointError, match="other weights"):
+        Calibration.load(tmp_path, agent)
+    (tmp_path / "monitor.safetensors").write_bytes(b"nothing")
+    with pytest.raises(CheckpointError, match="expected a calibration"):
+        Calibration.load(tmp_path, agent)
+
+
+def test_a_calibration_calls_its_own_episodes_clean_and_a_fault_strange():
+    agent, env = load("pendulum"), PendulumEnv(batch_size=[1], seed=0)
+    found = calibrate(agent, env, episodes=24, horizon=10, pictures=2000)
+    assert found.false_alarms == pytest.approx(7 / 25)
+    start = starts(agent, env, 24, torch.Generator().manual_seed(9))
+    alarms = {}
+    for name, strength in (("dark", 1.0), ("dark", 0.0)):
+        watching = Watching(agent, found, change=CameraFault(name, strength, onset=5, noise=NOISE))
+        simulate(watching, env, start=start, horizon=10)
+        alarms[strength] = watching.alarms().any(0).float().mean()
+    assert float(alarms[1.0]) < 0.5
+    assert float(alarms[0.0]) == 1.0
+
+
+def test_every_fault_changes_what_is_shown_at_every_strength():
+    env = PendulumEnv(batch_size=[1], seed=0)
+    for name, strengths in FAULTS.items():
+        for strength in strengths:
+            camera, differs, state = CameraFault(name, strength, onset=2), False, torch.tensor([[0.5, 2.0]])
+            before = env.previous_state(state)
+            for t in range(10):
+                clean = torch.cat([env.draw(before), env.draw(state)], 1)
+                made = camera(clean, t)
+                assert made.shape == clean.shape
+                assert made.dtype == torch.uint8
+                assert t >= 2 or torch.equal(made, clean)
+                differs |= not torch.equal(made, clean)
+                before, state = state, env.wrap(env.dynamics(state, torch.ones(1, 1)))
+            assert differs or name == "dropped"  # two in a hundred frames
+    with pytest.raises(ConfigError, match="faults"):
+        CameraFault("rain", 1.0)

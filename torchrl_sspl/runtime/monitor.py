@@ -1,0 +1,467 @@
+r"""The monitor: what an agent knows at every step, and an alarm where its pictures or their order are not what it knows."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor, nn
+from torch.nn import functional as F
+from tqdm import tqdm
+
+from torchrl_sspl.certification.certificate import weights_digest
+from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.evaluation.controllers import Decision
+from torchrl_sspl.evaluation.simulation import simulate
+from torchrl_sspl.modules.agent import Agent, agent_directory
+from torchrl_sspl.modules.controller import Memory, meets_premise
+from torchrl_sspl.modules.networks import mlp
+from torchrl_sspl.runtime.faults import CameraFault
+from torchrl_sspl.seeds import spawn
+
+FILE = "monitor.safetensors"
+#: What is watched besides the premise of the proof and the barrier.
+SIGNALS = ("innovation", "picture", "place", "texture", "order", "still")
+TWO_SIDED = ("texture",)
+FALLBACKS = ("policy", "stop")
+_SIDE = 16  # of the pictures that are expected
+_ROOM = 1.05  # beyond the largest value that was seen
+_LEAST = {"order": 0.5 / 255}  # limits that rounding alone must not exceed
+_LATE = 0.5  # of the period, by which a picture may come early or late
+
+
+class Verdict(IntEnum):
+    """What is known about a step. Source: none."""
+
+    PROOF_APPLIES = 0
+    INSIDE = 1  # in the set, but the premise of the proof was not met
+    OUTSIDE = 2
+    UNKNOWN_PICTURE = 3  # an alarm: nothing is believed
+
+
+@dataclass
+class Watched:
+    """One step of n systems: what is done, and what is known."""
+
+    action: Tensor  # (n, m) physical units, of the agent or of the fallback
+    verdict: Tensor  # (n,) int64, see Verdict
+    alarm: Tensor  # (n,) bool
+    barrier: Tensor  # (n,) B of the memory
+    signals: dict[str, Tensor]  # (n,) by name; NaN where there is nothing to compare
+    reasons: list[list[str]]  # of every row, the signals beyond their limits in this step
+    latent: Tensor  # (n, p)
+
+
+class PictureModel(nn.Module):
+    r"""The picture that belongs to a latent, small: :math:`(n, p) \mapsto (n, 3, 16, 16)` in [0, 1]. Source: none.
+
+    Example:
+        >>> PictureModel(3)(torch.zeros(2, 3)).shape
+        torch.Size([2, 3, 16, 16])
+    """
+
+    def __init__(self, latent_dim: int) -> None:
+        super().__init__()
+        self.net = mlp((latent_dim, 64, 96, 3 * _SIDE**2))
+
+    def forward(self, latent: Tensor) -> Tensor:
+        """Pictures of latents ``(n, p)``."""
+        return torch.sigmoid(self.net(latent)).unflatten(-1, (3, _SIDE, _SIDE))
+
+    def fit(self, latent: Tensor, picture: Tensor, *, steps: int = 3000, seed: int = 0, progress: bool = False) -> None:
+        """Regress on latents ``(n, p)`` and small pictures ``(n, 3, 16, 16)``."""
+        adam = torch.optim.Adam(self.parameters(), 3e-3)
+        cycle = torch.optim.lr_scheduler.OneCycleLR(adam, 3e-3, total_steps=steps)
+        g = torch.Generator().manual_seed(seed)
+        with torch.enable_grad():
+            for _ in tqdm(range(steps), desc="pictures", disable=not progress, leave=False):
+                rows = torch.randint(len(latent), (256,), generator=g)
+                loss = (self(latent[rows]) - picture[rows]).square().mean()
+                adam.zero_grad()
+                loss.backward()
+                adam.step()
+                cycle.step()
+        self.requires_grad_(False)
+
+
+@dataclass
+class Calibration:
+    """What clean pictures of an agent's system look like, and the limits of the signals."""
+
+    model: PictureModel
+    limits: dict[str, tuple[float, float]]  # by signal, what is still clean
+    episodes: int  # from which the limits were taken
+    steps: int  # in each of them
+    weights: str  # digest of the agent
+
+    @property
+    def false_alarms(self) -> float:
+        r"""Largest expected share of clean episodes with an alarm: :math:`k / (n + 1)`.
+
+        One of n + 1 exchangeable episodes has the largest value of a signal; there are k one-sided limits.
+        """
+        return min(1.0, (len(SIGNALS) + len(TWO_SIDED)) / (self.episodes + 1))
+
+    def save(self, directory: str | Path) -> Path:
+        """Write ``monitor.safetensors`` beside an agent; returns the file."""
+        path = Path(directory) / FILE
+        path.parent.mkdir(parents=True, exist_ok=True)
+        about = {"limits": self.limits, "episodes": self.episodes, "steps": self.steps, "weights": self.weights}
+        state = {k: v.contiguous() for k, v in self.model.state_dict().items()}
+        save_file(state, path, {k: json.dumps(v) for k, v in about.items()})
+        return path
+
+    @classmethod
+    def load(cls, name: str | Path, agent: Agent) -> Calibration:
+        """Read it from beside an agent; a CheckpointError if there is none, or one of another agent."""
+        path = agent_directory(name) / FILE
+        if not path.is_file():
+            raise CheckpointError(f"expected a calibration in '{path}', received none; make one: sspl.calibrate(agent, env).save(...)")
+        try:
+            with safe_open(path, "pt") as file:
+                about = {k: json.loads(v) for k, v in file.metadata().items()}
+                state = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
+            model = PictureModel(agent.latent_dim)
+            model.load_state_dict(state)
+            model.requires_grad_(False)
+            limits = {k: (float(a), float(b)) for k, (a, b) in about["limits"].items()}
+            found = cls(model, limits, int(about["episodes"]), int(about["steps"]), str(about["weights"]))
+        except (SafetensorError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"expected a calibration in '{path}', received {type(error).__name__}: {str(error)[:200]}") from error
+        if found.weights != weights_digest(agent.state_dict()) or set(limits) != set(SIGNALS):
+            raise CheckpointError(f"expected a calibration of this agent in '{path}', received one of other weights; calibrate again")
+        return found
+
+
+class Monitor:
+    r"""Runs an agent, and says at every step what is known: proof applies, inside, outside, or unknown picture.
+
+    Watched are, besides the barrier and the premise of the proof: ``innovation`` (distance of what is seen from what was expected,
+    latent units), ``picture`` and ``place`` (mean and largest difference of the frame from the one that belongs to its latent,
+    of 1, on 16 x 16), ``texture`` (mean difference of neighbouring pixels, of 1: blur and noise), ``order`` (difference of a
+    frame from itself one step later, of 1), ``still`` (steps during which not one pixel changed). A signal beyond its limit is an alarm, which ends after so many clean steps. Numbers that are not finite, frames of
+    another size or kind, missing frames and times that do not fit are alarms at once; the memory then goes on with
+    what it expects. Limits are the largest values of clean episodes (:func:`calibrate`), so that a clean episode has an
+    alarm with a probability of at most :attr:`Calibration.false_alarms`. Source: none (novelty by reconstruction; limits by
+    exchangeability, as in conformal prediction).
+
+    Args:
+        agent: frozen agent.
+        calibration: of this agent.
+        batch_size: n.
+        fallback: what is done during an alarm: ``"policy"`` (the agent goes on), ``"stop"`` (zero action), or a function
+            ``(Watched) -> (n, m)`` of which the rows with an alarm are taken.
+        period: time between two pictures, in the unit of the times given to :meth:`step`.
+        clear_after: clean steps that end an alarm.
+        signals: which of :data:`SIGNALS` are watched.
+
+    Raises:
+        ConfigError: for options that are not valid.
+
+    Example:
+        >>> black = torch.zeros(1, 6, 64, 64, dtype=torch.uint8)
+        >>> Verdict(int(Monitor.load("pendulum").step(black).verdict)).name
+        'UNKNOWN_PICTURE'
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        calibration: Calibration,
+        *,
+        batch_size: int = 1,
+        fallback: str | Callable[[Watched], Tensor] = "policy",
+        period: float | None = None,
+        clear_after: int = 10,
+        signals: Sequence[str] = SIGNALS,
+    ) -> None:
+        if isinstance(signals, str) or not set(signals) <= set(SIGNALS):
+            raise ConfigError(f"expected signals among {', '.join(SIGNALS)}, received {signals!r}")
+        if batch_size < 1 or clear_after < 1 or not (callable(fallback) or fallback in FALLBACKS) or not (period is None or period > 0):
+            raise ConfigError(
+                f"expected batch_size >= 1, clear_after >= 1, fallback in {FALLBACKS} or a function, and a positive period or None, "
+                f"received {batch_size}, {clear_after}, {fallback!r} and {period}"
+            )
+        self.agent, self.calibration, self.batch_size = agent, calibration, batch_size
+        self.fallback, self.period, self.clear_after, self.signals = fallback, period, clear_after, tuple(signals)
+        self._memory = Memory(agent)
+        self.reset()
+
+    @classmethod
+    def load(cls, name: str | Path, **options: Any) -> Monitor:
+        """The monitor of a shipped agent, or of a run directory, by its calibration there; options and errors as above."""
+        agent = Agent.load(agent_directory(name))
+        return cls(agent, Calibration.load(name, agent), **options)
+
+    def reset(self, rows: Tensor | None = None) -> None:
+        """Begin new episodes: all n, or those of some rows (indices or a mask)."""
+        n = self.batch_size
+        if rows is None:
+            self._memory.forget()
+            self._applies, self._fresh = torch.ones(n, dtype=torch.bool), torch.ones(n, dtype=torch.bool)
+            self._quiet = torch.full((n,), self.clear_after)
+            self._frame: Tensor | None = None
+            self._still = torch.zeros(n)
+            self._time: Tensor | None = None
+            return
+        index = torch.arange(n)[rows]
+        self._memory.forget(index)
+        self._applies[index], self._fresh[index] = True, True
+        self._quiet[index], self._still[index] = self.clear_after, 0.0
+
+    @torch.no_grad()
+    def step(self, pixels: Tensor | None, time: float | Tensor | None = None) -> Watched:
+        """What to do and what is known.
+
+        Args:
+            pixels: ``(n, 6, H, W)`` uint8, frames t-1 and t; ``None`` if no picture came.
+            time: when the pictures were taken, a number or ``(n,)``.
+
+        Raises ShapeError for another number of pictures.
+        """
+        agent, n = self.agent, self.batch_size
+        late = self._late(time)
+        if pixels is not None and (pixels.ndim < 1 or len(pixels) != n):
+            raise ShapeError(f"expected pictures of {n} systems, received {tuple(pixels.shape)}; make a monitor for them")
+        fault = self._unreadable(pixels)
+        if fault or pixels is None:
+            return self._blind(fault, late)
+        seen = agent.encode(pixels)
+        latent, innovation, _ = self._memory.correct(seen)
+        expected = seen - innovation
+        signals = {"innovation": innovation.norm(dim=-1).masked_fill(self._fresh, math.nan)} | self._looked_at(pixels, seen)
+        barrier = agent.barrier(latent)[:, 0]
+        met = meets_premise(agent, barrier, agent.barrier(seen)[:, 0], (latent - expected).norm(dim=-1))
+        reasons = [[] for _ in range(n)] if late is None else [["time"] if bool(one) else [] for one in late]
+        for name in self.signals:
+            value, (low, high) = signals[name], self.calibration.limits[name]
+            beyond = (value > high) | (value < low) | value.isinf()
+            for k in beyond.nonzero()[:, 0].tolist():
+                reasons[k].append(name)
+        return self._decided(latent, barrier, met, signals, reasons)
+
+    def _looked_at(self, pixels: Tensor, seen: Tensor) -> dict[str, Tensor]:
+        """The signals that pictures give, and what is remembered of them."""
+        before, frame = pixels[:, :3], pixels[:, 3:].float() / 255.0
+        off = (small(frame) - self.calibration.model(seen)).abs().mean(1)
+        texture = (frame.diff(dim=-1).abs().mean((1, 2, 3)) + frame.diff(dim=-2).abs().mean((1, 2, 3))) / 2
+        known = torch.full((len(pixels),), math.nan) if self._frame is None else _apart(before, self._frame)
+        same = (pixels[:, :3] == pixels[:, 3:]).flatten(1).all(1)
+        self._still = torch.where(same & ~self._fresh, self._still + 1.0, 0.0)
+        self._frame = pixels[:, 3:].clone()
+        return {
+            "picture": off.mean((1, 2)), "place": off.amax((1, 2)), "texture": texture,
+            "order": known.masked_fill(self._fresh, math.nan), "still": self._still.clone(),
+        }  # fmt: skip
+
+    def _unreadable(self, pixels: Tensor | None) -> str:
+        """Why pictures cannot be looked at; "" if they can."""
+        if pixels is None:
+            return "missing"
+        size = getattr(self.agent.encoder, "image_size", None)
+        wrong = pixels.ndim != 4 or pixels.shape[1] != 6 or (size is not None and tuple(pixels.shape[2:]) != tuple(size))
+        return "kind" if pixels.dtype != torch.uint8 else "size" if wrong else ""
+
+    def _late(self, time: float | Tensor | None) -> Tensor | None:
+        """``(n,)`` bool, which pictures came too early or too late; None where nobody looks."""
+        if time is None or self.period is None:
+            return None
+        now = torch.as_tensor(time, dtype=torch.float64).expand(self.batch_size).clone()
+        before, self._time = self._time, now
+        if before is None:
+            return ~now.isfinite()
+        fits = ((now - before - self.period).abs() <= _LATE * self.period) | self._fresh
+        return ~(fits & now.isfinite())
+
+    def _blind(self, fault: str, late: Tensor | None) -> Watched:
+        """A step without a picture: the memory goes on with what it expects, and the proof no longer applies."""
+        memory, n = self._memory, self.batch_size
+        if memory.prior is None or bool(self._fresh.any()):  # nothing is expected yet
+            memory.prior = torch.zeros(n, self.agent.latent_dim) if memory.prior is None else memory.prior
+            memory.begins = torch.ones(n, dtype=torch.bool) if memory.begins is None else memory.begins
+        latent = memory.prior
+        signals = {name: torch.full((n,), math.nan) for name in SIGNALS}
+        reasons = [[fault] + (["time"] if late is not None and bool(late[k]) else []) for k in range(n)]
+        return self._decided(latent, self.agent.barrier(latent)[:, 0], torch.zeros(n, dtype=torch.bool), signals, reasons, blind=True)
+
+    def _decided(
+        self, latent: Tensor, barrier: Tensor, met: Tensor, signals: dict[str, Tensor], reasons: list[list[str]], blind: bool = False
+    ) -> Watched:
+        """The verdict, and the action that belongs to it."""
+        strange = torch.tensor([bool(r) for r in reasons])
+        self._quiet = torch.where(strange, 0, self._quiet + 1)
+        alarm = self._quiet < self.clear_after
+        self._applies &= met
+        verdict = torch.where(self._applies, Verdict.PROOF_APPLIES, Verdict.INSIDE)
+        verdict = torch.where(barrier <= 0.0, verdict, Verdict.OUTSIDE).masked_fill(alarm, Verdict.UNKNOWN_PICTURE)
+        action = self.agent.policy(latent)
+        told = Watched(action, verdict, alarm, barrier, signals, reasons, latent)
+        if bool(alarm.any()) and self.fallback != "policy":
+            other = torch.zeros_like(action) if self.fallback == "stop" else self.fallback(told)  # type: ignore[operator]
+            if not isinstance(other, Tensor) or other.shape != action.shape:
+                raise ShapeError(f"expected a fallback that returns actions {tuple(action.shape)}, received {getattr(other, 'shape', other)}")
+            told.action = torch.where(alarm[:, None], other, action)
+        begun = ~self._fresh | (not blind)
+        after = self.agent.dynamics(latent, told.action)
+        self._memory.expect(after, begun.nonzero()[:, 0])
+        self._fresh = ~begun
+        return told
+
+
+def small(frame: Tensor) -> Tensor:
+    """Frames ``(n, 3, H, W)`` in [0, 1], averaged to 16 x 16."""
+    return F.adaptive_avg_pool2d(frame, _SIDE)
+
+
+def _apart(a: Tensor, b: Tensor) -> Tensor:
+    """Mean difference of frames uint8, of 1."""
+    return (a.float() - b.float()).abs().mean((1, 2, 3)) / 255.0
+
+
+class Watching:
+    """A monitor as what acts in :func:`~torchrl_sspl.evaluation.simulate`; keeps every step's signals and alarms.
+
+    Source: none.
+
+    Args:
+        agent, calibration: of the monitor.
+        change: ``(pixels, t) -> pixels`` between the camera and the monitor, such as a fault; ``None``: nothing.
+        driver: what acts in place of the agent.
+        **options: of the monitor.
+    """
+
+    reads = "pixels"
+
+    def __init__(
+        self,
+        agent: Agent,
+        calibration: Calibration,
+        *,
+        change: Callable[[Tensor, int], Tensor] | None = None,
+        driver: Any = None,
+        **options: Any,
+    ) -> None:
+        self.agent, self.calibration, self.change, self.driver, self.options = agent, calibration, change, driver, options
+        self.monitor: Monitor | None = None
+        self.chunks: list[list[tuple[Tensor, Mapping[str, Tensor], Tensor]]] = []  # alarms, signals and rows, by chunk and step
+
+    def reset(self, rows: Tensor | None = None) -> None:
+        """Forget everything, or some episodes."""
+        if rows is not None and self.monitor is not None:
+            self.monitor.reset(rows)
+            return
+        self.monitor = None
+        self.chunks.append([])
+        if self.driver is not None:
+            self.driver.reset()
+
+    def step(self, observation: Tensor, rows: Tensor | None = None) -> Decision:
+        """Actions for what is shown."""
+        steps = self.chunks[-1]
+        if self.monitor is None:
+            self.monitor = Monitor(self.agent, self.calibration, batch_size=len(observation), **self.options)
+        n, index = self.monitor.batch_size, torch.arange(len(observation)) if rows is None else rows
+        shown = observation
+        if len(observation) < n:  # whoever is gone is shown nothing; it is looked at no more
+            shown = torch.zeros(n, *observation.shape[1:], dtype=torch.uint8).index_copy(0, index, observation)
+        out = self.monitor.step(shown if self.change is None else self.change(shown, len(steps)))
+        steps.append((out.alarm & torch.zeros(n, dtype=torch.bool).index_fill(0, index, True), out.signals, index))
+        action = out.action[index]
+        if self.driver is not None:
+            action = self.driver.step(observation, rows).action
+            self.monitor._memory.expect(self.agent.dynamics(out.latent[index], action), None if rows is None else index)
+        return Decision(action=action, barrier=out.barrier[index], seen=out.barrier[index])
+
+    def alarms(self) -> Tensor:
+        """``(T + 1, n)`` bool, of all episodes."""
+        return torch.cat([torch.stack([alarm for alarm, _, _ in chunk]) for chunk in self.chunks if chunk], 1)
+
+    def extremes(self) -> dict[str, Tensor]:
+        """Smallest and largest value of every signal in every episode, ``(2, n)``."""
+        found: dict[str, list[Tensor]] = {name: [] for name in SIGNALS}
+        for chunk in self.chunks:
+            for name in SIGNALS if chunk else ():
+                low = torch.full((len(chunk[0][0]),), math.inf)
+                high = -low
+                for _, signals, rows in chunk:
+                    value = signals[name][rows]
+                    low[rows] = torch.minimum(low[rows], value.nan_to_num(nan=math.inf))
+                    high[rows] = torch.maximum(high[rows], value.nan_to_num(nan=-math.inf))
+                found[name].append(torch.stack([low, high]))
+        return {name: torch.cat(parts, 1) for name, parts in found.items()}
+
+
+@torch.no_grad()
+def calibrate(
+    agent: Agent,
+    env: Any,
+    *,
+    episodes: int = 1000,
+    horizon: int = 200,
+    noise: float = 1.0,
+    pictures: int = 20_000,
+    seed: int = 0,
+    progress: bool = False,
+) -> Calibration:
+    """What clean pictures look like: a model of them, and limits from episodes of the agent.
+
+    The model is fitted to pictures of uniform states; the limits are the largest values of episodes that start in {B <= 0}. What is
+    shown here is never called strange. Cameras have noise: one that shows the very same frame twice is frozen. A simulator without
+    noise does that at rest, and a frozen camera cannot be told from it in time; calibrate with ``noise=0`` for it.
+
+    Args:
+        agent: frozen agent.
+        env: a system of this library, whose states are known; it is only asked for pictures and starts.
+        episodes: for the limits; the false alarms are as rare as there are many.
+        horizon: steps of each.
+        noise: standard deviation of the camera's noise, grey levels, added to every frame.
+        pictures: for the model.
+        seed: root of everything drawn.
+        progress: show progress bars.
+
+    Raises ConfigError if no start lies in the set. Source: none.
+    """
+    g = torch.Generator().manual_seed(spawn(seed, "monitor", 0))
+    with torch.random.fork_rng():
+        torch.manual_seed(spawn(seed, "monitor", 1))
+        model = PictureModel(agent.latent_dim)
+    latents, shown = [], []
+    for part in env.sample_states(pictures, g).split(1000):
+        now, before = env.draw(part), env.draw(env.previous_state(part))
+        latents.append(agent.encode(torch.cat([before, now], 1)))
+        shown.append(small(now.float() / 255.0))
+    model.fit(torch.cat(latents), torch.cat(shown), seed=spawn(seed, "monitor", 2), progress=progress)
+    wide = {name: (-math.inf, math.inf) for name in SIGNALS}
+    calibration = Calibration(model, wide, episodes, horizon, weights_digest(agent.state_dict()))
+    start = starts(agent, env, episodes, g)
+    watching = Watching(agent, calibration, change=CameraFault("dark", 1.0, noise=noise, seed=spawn(seed, "monitor", 3)))
+    simulate(watching, env, start=start, horizon=horizon, label="clean episodes" if progress else None)
+    for name, (low, high) in watching.extremes().items():
+        most, least = float(high.max()), float(low.min())
+        limit = max(most * _ROOM, _LEAST.get(name, 0.0))
+        calibration.limits[name] = (least / _ROOM if name in TWO_SIDED else -math.inf, limit)
+    return calibration
+
+
+@torch.no_grad()
+def starts(agent: Agent, env: Any, n: int, generator: torch.Generator) -> Tensor:
+    """``(n, s)`` uniform states outside U whose pictures lie in the set; a ConfigError if there are none."""
+    found: list[Tensor] = []
+    for _ in range(50):
+        for part in env.sample_states(1000, generator, region=env.state_space - env.unsafe_set).split(1000):
+            seen = agent.encode(torch.cat([env.draw(env.previous_state(part)), env.draw(part)], 1))
+            found.append(part[agent.barrier(seen)[:, 0] <= 0.0])
+        if sum(map(len, found)) >= n:
+            return torch.cat(found)[:n]
+    raise ConfigError(f"expected {n} states whose pictures lie in the set, received {sum(map(len, found))}; is the set empty?")
+
+
+__all__ = ["Calibration", "Monitor", "PictureModel", "Verdict", "Watched", "Watching", "calibrate", "starts"]
