@@ -33,7 +33,7 @@ SECTIONS = {  # in the order of the floors, from the mathematics to the tools
     "certification": "Certification",
     "data": "Data",
     "objectives": "Losses",
-    "safety": "Run-time safety",
+    "runtime": "At run time",
     "trainers": "Training",
     "viz": "Figures and reports",
     "cli": "Command line",

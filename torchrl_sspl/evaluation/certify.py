@@ -59,6 +59,8 @@ _BROKEN = (SSPLError, ImportError, RuntimeError, TypeError, ValueError)
 _CERTIFIED_KEYS = ("networks", "config", "training", "lipschitz", "seeds", "environment", "trained_on", "tolerated_error")
 
 
+#: More than a correction that is cut to a length, computed in float32, is longer than that: 2^-22 an entry of up to ten, of [-1, 1].
+_CUT = 1e-6
 #: One step in so many may be another on another machine, where episodes end early.
 _LATE = 200
 #: How far beyond the Lipschitz argument a tolerated error is looked for, in how many steps, and with how many boxes each.
@@ -258,7 +260,8 @@ def premise(agent: Agent, *, budget: Budget | None = None) -> float:
     """Error per step that {B <= 0} is proved to tolerate, by the numbers that the agent computes; 0 where it is not kept.
 
     This is what an agent's run-time monitor compares with: put it into ``agent.description["tolerated_error"]``. It is a
-    thousandth smaller than what was found, so that another machine finds it, too. Source: none.
+    thousandth smaller than what was found, so that another machine finds it, too, and by what computing a correction of this
+    length may round off. Source: none.
 
     Args:
         agent: frozen agent.
@@ -285,7 +288,7 @@ def premise(agent: Agent, *, budget: Budget | None = None) -> float:
             low = middle
         else:
             high = middle
-    return 0.999 * low
+    return max(0.0, 0.999 * low - _CUT)
 
 
 def _witness(agent: Agent) -> list[Tensor] | None:

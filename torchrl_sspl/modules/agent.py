@@ -21,6 +21,7 @@ from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.lipschitz import prove_lipschitz
 from torchrl_sspl.modules.controller import Controller
+from torchrl_sspl.modules.export import export
 from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
 from torchrl_sspl.modules.observer import gain_matrix
@@ -165,9 +166,10 @@ class Agent(nn.Module):
         return Controller(self, batch_size)
 
     def export(self, path: str | Path, **options: Any) -> Path:
-        """Write one step for a machine without this library; see :func:`torchrl_sspl.runtime.export`."""
-        from torchrl_sspl.runtime.export import export
+        """Write one step for a machine without this library: ``.onnx``, or ``.pt2`` for ``torch.export.load``; returns the path.
 
+        Options, inputs, outputs and errors are those of ``torchrl_sspl.modules.export``.
+        """
         return export(self, path, **options)
 
     @property

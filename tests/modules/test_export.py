@@ -14,9 +14,7 @@ import torch
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CertificationError, ConfigError
 from torchrl_sspl.modules.agent import load
-from torchrl_sspl.runtime import DeployedStep
-from torchrl_sspl.runtime import export as exporting
-from torchrl_sspl.runtime.export import INPUTS, OUTPUTS, _steps
+from torchrl_sspl.modules.export import INPUTS, OUTPUTS, DeployedStep, _compare, _steps
 
 DEPLOY = Path(__file__).resolve().parents[2] / "examples" / "deploy"
 
@@ -84,14 +82,14 @@ def test_the_file_says_what_it_is(onnx_file):
     assert about["tolerated_error"] == load("pendulum").tolerated_error
 
 
-def test_programmes_of_torch_are_checked_too(tmp_path, monkeypatch):
+def test_programmes_of_torch_are_checked_too(tmp_path):
     agent = load("pendulum")
     assert agent.export(tmp_path / "deep" / "agent.pt2", check=8).is_file()
     other = load("pendulum")
     with torch.no_grad():
         other.policy.action_scale.mul_(1.01)
     with pytest.raises(CertificationError, match="exported"):
-        exporting.__globals__["_compare"](DeployedStep(other), tmp_path / "deep" / "agent.pt2", 8)
+        _compare(DeployedStep(other), tmp_path / "deep" / "agent.pt2", 8)
 
 
 def test_another_suffix_is_refused(tmp_path):

@@ -11,8 +11,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from torchrl_sspl.certification.certificate import weights_digest
 from torchrl_sspl.errors import CertificationError, ConfigError, MissingDependencyError
-from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.controller import meets_premise
 from torchrl_sspl.modules.observer import corrected, held
 
@@ -43,7 +43,7 @@ class DeployedStep(nn.Module):
         [(2, 1), (2,), (2,), (2,), (2,), (2, 3)]
     """
 
-    def __init__(self, agent: Agent) -> None:
+    def __init__(self, agent: Any) -> None:
         super().__init__()
         self.agent = agent
         # As numbers: nothing may be decided by tensors where a graph is traced.
@@ -61,7 +61,7 @@ class DeployedStep(nn.Module):
         return agent.policy(now), barrier, of_seen, innovation.norm(dim=-1), met, now
 
 
-def export(agent: Agent, path: str | Path, *, check: int = 256) -> Path:
+def export(agent: Any, path: str | Path, *, check: int = 256) -> Path:
     """Writes one step of an agent, :class:`DeployedStep`, for a machine without this library.
 
     The suffix says what: ``.onnx`` for onnxruntime and the like, ``.pt2`` for ``torch.export.load``. The batch is dynamic. An ONNX
@@ -113,22 +113,20 @@ def _required(package: str) -> Any:
         ) from error
 
 
-def _about(agent: Agent) -> dict[str, Any]:
+def _about(agent: Any) -> dict[str, Any]:
     """What a machine that runs the file has to know."""
-    from torchrl_sspl.certification.certificate import weights_digest
-
     return {
         "pixels": list(_picture(agent)), "latent_dim": agent.latent_dim, "tolerated_error": agent.tolerated_error,
         "action_scale": agent.policy.action_scale.flatten().tolist(), "weights": weights_digest(agent.state_dict()),  # type: ignore[operator, union-attr]
     }  # fmt: skip
 
 
-def _picture(agent: Agent) -> tuple[int, int, int]:
+def _picture(agent: Any) -> tuple[int, int, int]:
     size = getattr(agent.encoder, "image_size", None) or (_SIZE, _SIZE)
     return 6, int(size[0]), int(size[1])
 
 
-def _steps(agent: Agent, n: int, seed: int) -> dict[str, Tensor]:
+def _steps(agent: Any, n: int, seed: int) -> dict[str, Tensor]:
     """Random steps, by the name of the input."""
     g = torch.Generator().manual_seed(seed)
     scale = agent.policy.action_scale.flatten().cpu()  # type: ignore[operator, union-attr]
