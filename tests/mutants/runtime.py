@@ -2,6 +2,8 @@
 
 OBSERVER, CONTROLLER = "torchrl_sspl/modules/observer.py", "torchrl_sspl/modules/controller.py"
 FILTER, WRAPPER, BLOCKS = "torchrl_sspl/runtime/filter.py", "torchrl_sspl/runtime/wrapper.py", "torchrl_sspl/evaluation/blocks.py"
+MONITOR, EXPORT, FAULTS = "torchrl_sspl/runtime/monitor.py", "torchrl_sspl/modules/export.py", "torchrl_sspl/runtime/faults.py"
+WATCHED, EXPORTED = "tests/runtime/test_monitor.py", "tests/modules/test_export.py"
 OBSERVED, FILTERED, RUN_TIME = "tests/modules/test_observer.py", "tests/runtime/test_filter.py", "tests/certification/test_run_time.py"
 
 MUTANTS = [
@@ -45,4 +47,24 @@ MUTANTS = [
     (WRAPPER, "and float(agent.barrier(seen)) <= 0.0", "", FILTERED),
     (WRAPPER, "self._applies &= agent", "self._applies = agent", FILTERED),
     (WRAPPER, "pixels.permute(0, 3, 1, 2).flatten(0, 1)", "pixels.permute(3, 0, 1, 2).flatten(0, 1)", FILTERED),
+    (MONITOR, "beyond = (value > high) | (value < low) | value.isinf()", "beyond = value > 1.01 * high", WATCHED),
+    (MONITOR, "(value > high) | (value < low)", "(value > high)", WATCHED),
+    (MONITOR, "alarm = self._quiet < self.clear_after", "alarm = self._quiet < 1", WATCHED),
+    (MONITOR, "self._applies &= met", "self._applies = met", WATCHED),
+    (MONITOR, ".masked_fill(alarm, Verdict.UNKNOWN_PICTURE)", "", WATCHED),
+    (MONITOR, "torch.where(barrier <= 0.0, verdict, Verdict.OUTSIDE)", "verdict", WATCHED),
+    (MONITOR, "torch.where(alarm[:, None], other, action)", "other", WATCHED),
+    (MONITOR, "after = self.agent.dynamics(latent, told.action)", "after = self.agent.dynamics(latent, action)", WATCHED),
+    (MONITOR, "self._still + 1.0, 0.0)", "0.0, 0.0)", WATCHED),
+    (MONITOR, "self._frame = pixels[:, 3:].clone()", "self._frame = pixels[:, :3].clone()", WATCHED),
+    (MONITOR, "fits = ((now - before - self.period).abs() <= _LATE * self.period)", "fits = ((now - before).abs() <= 9 * self.period)", WATCHED),
+    (MONITOR, "found.weights != weights_digest(agent.state_dict())", "False", WATCHED),
+    (MONITOR, "most * _ROOM", "most * 0.5", WATCHED),
+    (MONITOR, "(len(SIGNALS) + len(TWO_SIDED)) / (self.episodes + 1)", "1 / (self.episodes + 1)", WATCHED),
+    (MONITOR, "self._applies[index], self._fresh[index] = True, True", "self._fresh[index] = True", WATCHED),
+    (FAULTS, "return torch.cat([before, frame], 1)", "return torch.cat([frame, frame], 1)", WATCHED),
+    (EXPORT, "torch.where(begins[:, None], seen, agent.dynamics(latent, action))", "agent.dynamics(latent, action)", EXPORTED),
+    (EXPORT, "held(agent.barrier, prior, now, self.proved.held_error)", "held(agent.barrier, prior, now, 0.0)", EXPORTED),
+    (EXPORT, "if not all(v <= _TOLERANCE for v in off.values()):", "if False:", EXPORTED),
+    (EXPORT, "return agent.policy(now), barrier, of_seen", "return agent.policy(now), of_seen, barrier", EXPORTED),
 ]  # fmt: skip

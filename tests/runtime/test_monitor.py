@@ -64,6 +64,19 @@ def test_severe_faults_are_alarms_within_three_steps(fault):
     assert bool(torch.stack(alarms[6:9]).any(0).all())
 
 
+@pytest.mark.parametrize("name", ["picture", "place", "texture", "order", "innovation"])
+def test_limits_are_those_of_the_calibration(name):
+    pictures = shown(1, 2)
+    monitor = Monitor.load("pendulum")
+    monitor.step(pictures[0])
+    value = float(monitor.step(pictures[1]).signals[name])
+    for limits, beyond in (((-1.0, value + 1e-6), False), ((-1.0, value - 1e-6), True), ((value + 1e-6, 9.0), True)):
+        monitor.reset()
+        monitor.calibration.limits[name] = limits
+        monitor.step(pictures[0])
+        assert (name in monitor.step(pictures[1]).reasons[0]) is beyond
+
+
 def test_rows_have_alarms_and_resets_of_their_own():
     monitor = Monitor.load("pendulum", batch_size=2)
     good = shown(2)[0]
@@ -92,6 +105,16 @@ def test_fallbacks_act_during_an_alarm_only():
     assert float(monitor.step(shown()[0]).action) != 3.0
     with pytest.raises(ShapeError, match="fallback"):
         Monitor.load("pendulum", fallback=lambda told: torch.zeros(3)).step(black)
+
+
+def test_a_fallback_acts_on_the_rows_with_an_alarm_and_the_memory_knows_it():
+    monitor = Monitor.load("pendulum", batch_size=2, fallback=lambda told: torch.full_like(told.action, 3.0))
+    pictures = shown(2)[0]
+    pictures[1] = 0
+    out = monitor.step(pictures)
+    assert float(out.action[1]) == 3.0
+    assert float(out.action[0]) == pytest.approx(float(monitor.agent.policy(out.latent)[0]))
+    assert torch.equal(monitor._memory.prior, monitor.agent.dynamics(out.latent, out.action))
 
 
 @pytest.mark.parametrize(
