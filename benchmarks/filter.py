@@ -14,9 +14,9 @@ from tqdm import tqdm
 
 import torchrl_sspl as sspl
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.modules.controller import Memory
 from torchrl_sspl.runtime import Shield
+from torchrl_sspl.runtime.monitor import starts
 
 STEPS, SEED = 200, 20261122
 
@@ -36,8 +36,7 @@ def towards_u(state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor
 def main(name: str = "pendulum", episodes: int = 1000) -> None:
     """Print the table."""
     agent, env = sspl.load(name), PendulumEnv(batch_size=[1], seed=SEED)
-    state = env.sample_states(6 * episodes, torch.Generator().manual_seed(SEED), region=env.state_space - env.unsafe_set)
-    start = state[agent.barrier(encode_states(agent, env, state))[:, 0] <= 0][:episodes]
+    start = starts(agent, env, episodes, torch.Generator().manual_seed(SEED))
     print("| Actions | filter | episodes that enter U | steps with an intervention | mean deviation [half ranges] |\n|---|---|---|---|---|")
     policies = {"random": random_actions, "adversarial": towards_u, "the agent's own": None}
     for (label, wants), level in ((p, v) for p in policies.items() for v in (None, 0.0, -0.1)):
