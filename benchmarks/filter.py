@@ -1,6 +1,6 @@
 """The safety filter on the pendulum: episodes that enter U under random and adversarial actions, with it and without.
 
-Run: python benchmarks/filter.py [AGENT] [EPISODES]
+Run: python benchmarks/filter.py [AGENT] [EPISODES] [LEVEL ...]
 Prints a table in Markdown. Episodes have 200 steps and start in {B <= 0}, drawn with a seed of their own.
 """
 
@@ -33,13 +33,13 @@ def towards_u(state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor
 
 
 @torch.no_grad()
-def main(name: str = "pendulum", episodes: int = 1000) -> None:
+def main(name: str = "pendulum", episodes: int = 1000, *levels: float) -> None:
     """Print the table."""
     agent, env = sspl.load(name), PendulumEnv(batch_size=[1], seed=SEED)
     start = starts(agent, env, episodes, torch.Generator().manual_seed(SEED))
     print("| Actions | filter | episodes that enter U | steps with an intervention | mean deviation [half ranges] |\n|---|---|---|---|---|")
     policies = {"random": random_actions, "adversarial": towards_u, "the agent's own": None}
-    for (label, wants), level in ((p, v) for p in policies.items() for v in (None, 0.0, -0.1)):
+    for (label, wants), level in ((p, v) for p in policies.items() for v in levels or (None, 0.0, -0.1)):
         shield = None if level is None else Shield(agent, level=level)
         g, memory, x, before = torch.Generator().manual_seed(SEED + 1), Memory(agent), start, env.previous_state(start)
         entered, action = torch.zeros(len(x), dtype=torch.bool), torch.zeros(len(x), 1)
@@ -60,4 +60,5 @@ def main(name: str = "pendulum", episodes: int = 1000) -> None:
 
 
 if __name__ == "__main__":
-    main(*(kind(value) for kind, value in zip((str, int), sys.argv[1:], strict=False)))
+    given = sys.argv[1:]
+    main(*given[:1], *(int(v) for v in given[1:2]), *(float(v) for v in given[2:]))

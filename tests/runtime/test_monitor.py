@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
 from torchrl_sspl.evaluation import simulate
+from torchrl_sspl.evaluation.controllers import as_controller
 from torchrl_sspl.modules.agent import load
 from torchrl_sspl.runtime import Calibration, CameraFault, Monitor, Verdict, calibrate
 from torchrl_sspl.runtime.faults import FAULTS
@@ -105,6 +106,25 @@ def test_fallbacks_act_during_an_alarm_only():
     assert float(monitor.step(shown()[0]).action) != 3.0
     with pytest.raises(ShapeError, match="fallback"):
         Monitor.load("pendulum", fallback=lambda told: torch.zeros(3)).step(black)
+
+
+def test_what_was_really_done_is_what_the_memory_goes_on_from():
+    monitor, other = Monitor.load("pendulum"), load("pendulum")
+    out = monitor.step(shown()[0])
+    push = torch.full((1, 1), 7.0)
+    monitor.took(push)
+    assert torch.equal(monitor._memory.prior, other.dynamics(out.latent, push))
+    with pytest.raises(ShapeError, match="expected actions"):
+        monitor.took(torch.zeros(2, 1))
+
+
+def test_other_drivers_are_watched_with_their_own_actions():
+    agent, env = load("pendulum"), PendulumEnv(batch_size=[1], seed=0)
+    calibration = Calibration.load("pendulum", agent)
+    watching = Watching(agent, calibration, driver=as_controller(lambda pixels: torch.full((len(pixels), 1), 2.0)))
+    run = simulate(watching, env, start=UPRIGHT.expand(4, 2), horizon=5)
+    assert torch.equal(run.actions, torch.full((5, 4, 1), 2.0))
+    assert float(watching.extremes()["innovation"][1].max()) < calibration.limits["innovation"][1]
 
 
 def test_a_fallback_acts_on_the_rows_with_an_alarm_and_the_memory_knows_it():

@@ -248,6 +248,14 @@ class Monitor:
                 reasons[k].append(name)
         return self._decided(latent, barrier, met, signals, reasons)
 
+    def took(self, action: Tensor) -> None:
+        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told."""
+        if action.shape != self._told.action.shape:
+            raise ShapeError(f"expected actions {tuple(self._told.action.shape)}, received {tuple(action.shape)}")
+        rows = (~self._fresh).nonzero()[:, 0]
+        with torch.no_grad():
+            self._memory.expect(self.agent.dynamics(self._told.latent, action), rows)
+
     def _looked_at(self, pixels: Tensor, seen: Tensor) -> dict[str, Tensor]:
         """The signals that pictures give, and what is remembered of them."""
         before, frame = pixels[:, :3], pixels[:, 3:].float() / 255.0
@@ -313,6 +321,7 @@ class Monitor:
         after = self.agent.dynamics(latent, told.action)
         self._memory.expect(after, begun.nonzero()[:, 0])
         self._fresh = ~begun
+        self._told = told
         return told
 
 
@@ -377,7 +386,7 @@ class Watching:
         action = out.action[index]
         if self.driver is not None:
             action = self.driver.step(observation, rows).action
-            self.monitor._memory.expect(self.agent.dynamics(out.latent[index], action), None if rows is None else index)
+            self.monitor.took(out.action.index_copy(0, index, action))
         return Decision(action=action, barrier=out.barrier[index], seen=out.barrier[index])
 
     def alarms(self) -> Tensor:
