@@ -87,6 +87,13 @@ def test_programmes_of_torch_are_checked_too(tmp_path):
         _compare(DeployedStep(other), tmp_path / "deep" / "agent.pt2", 8)
 
 
+def test_the_callers_agent_is_not_touched(tmp_path):
+    agent = load("pendulum").train()
+    agent.export(tmp_path / "agent.pt2", check=0)
+    assert agent.training
+    assert agent.policy.training
+
+
 def test_another_suffix_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"\.onnx or \.pt2"):
         load("pendulum").export(tmp_path / "agent.pth")

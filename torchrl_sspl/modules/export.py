@@ -2,6 +2,7 @@ r"""One step of an agent as a file that runs without this library: ONNX, or a pr
 
 from __future__ import annotations
 
+import copy
 import json
 import warnings
 from pathlib import Path
@@ -86,7 +87,7 @@ def export(agent: Any, path: str | Path, *, check: int = 256) -> Path:
         raise ConfigError(f"expected a file that ends in .onnx or .pt2, received '{path.name}'")
     if path.suffix == ".onnx":
         _required("onnxscript")
-    step = DeployedStep(agent).cpu().eval()
+    step = DeployedStep(copy.deepcopy(agent)).cpu().eval()  # the caller's stays where it is
     dynamic = {name: {0: torch.export.Dim("n")} for name in INPUTS}
     example = tuple(_steps(agent, 2, 0).values())
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -147,8 +147,8 @@ class Monitor:
     Watched are, besides the barrier and the premise of the proof: ``innovation`` (distance of what is seen from what was expected,
     latent units), ``picture`` and ``place`` (mean and largest difference of the frame from the one that belongs to its latent,
     of 1, on 16 x 16), ``texture`` (mean difference of neighbouring pixels, of 1: blur and noise), ``order`` (difference of a
-    frame from itself one step later, of 1), ``still`` (steps during which not one pixel changed). A signal beyond its limit is an alarm, which ends after so many clean steps. Numbers that are not finite, frames of
-    another size or kind, missing frames and times that do not fit are alarms at once; the memory then goes on with
+    frame from itself one step later, of 1), ``still`` (steps during which not one pixel changed). A signal
+    beyond its limit is an alarm, which ends after so many clean steps. Frames of another size or kind, missing frames and times that do not fit are alarms at once; the memory then goes on with
     what it expects. Limits are the largest values of clean episodes (:func:`calibrate`), so that a clean episode has an
     alarm with a probability of at most :attr:`Calibration.false_alarms`. Source: none (novelty by reconstruction; limits by
     exchangeability, as in conformal prediction).
