@@ -11,6 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sspl.errors import CheckpointError, ConfigError, SSPLError
+from torchrl_sspl.files import write
+from torchrl_sspl.interrupts import interruptible
 
 _USAGE = """sspl COMMAND ...
 
@@ -69,7 +71,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"expected a command, one of {', '.join(commands)}, received '{words[0]}'\n\n{_USAGE}", file=sys.stderr)
         return 2
     try:
-        return commands[words[0]](words[1:])
+        with interruptible():
+            return commands[words[0]](words[1:])
     except SSPLError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 2
@@ -168,7 +171,7 @@ def _evaluate(words: list[str]) -> int:
         bounds = "" if m.lower is None or m.upper is None else f"  95 % bounds {m.lower:.3g} to {m.upper:.3g}"
         print(f"{name:<32} {value:>12} {m.unit}{size}{bounds}")
     if options.json:
-        Path(options.json).write_text(json.dumps(result.to_dict(), indent=1, sort_keys=True) + "\n")
+        write(options.json, json.dumps(result.to_dict(), indent=1, sort_keys=True) + "\n")
     return 0
 
 

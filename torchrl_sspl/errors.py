@@ -48,6 +48,10 @@ class CheckpointError(SSPLError, RuntimeError):
     """A checkpoint, a run directory or a shipped agent cannot be read."""
 
 
+class OutputError(SSPLError, OSError):
+    """A file or a directory cannot be written to, or belongs to another run."""
+
+
 class NotPositiveDefiniteError(SSPLError, ValueError):
     """A matrix has left the cone of positive definite matrices."""
 

@@ -310,9 +310,33 @@ def test_checkpoints_come_by_time(tmp_path: Path) -> None:
     assert saved == [6 * FRAMES]  # the end alone
     often = build(tmp_path / "often", checkpoint_seconds=0.0)
     save_often = often._save_trainer
-    often._save_trainer = lambda: (saved.append(often.collected_frames), save_often())  # type: ignore[method-assign]
+    often._save_trainer = lambda: (saved.append(often._optim_count), save_often())  # type: ignore[method-assign]
     often.train()
-    assert saved[1:] == [FRAMES * k for k in range(1, 7)]
+    assert saved[1:] == list(range(1, 25))  # after every optimiser step
+
+
+@pytest.mark.parametrize("step", [1, 7])
+def test_a_signal_between_two_steps_on_a_batch_continues_bit_for_bit(tmp_path: Path, capsys, step: int) -> None:
+    options: dict[str, Any] = {"batches": 3, "with_margins": True, "warm_start_steps": 6, "checkpoint_seconds": 3600.0}
+    for name in ("straight", "broken"):
+        (tmp_path / name).mkdir()
+    straight = build(tmp_path / "straight", out_dir=tmp_path / "straight", **options)
+    straight.train()
+    first = build(tmp_path / "broken", out_dir=tmp_path / "broken", **options)
+    first.register_op("post_optim", lambda: signal.raise_signal(signal.SIGTERM) if first._optim_count == step else None)
+    with pytest.raises(SystemExit) as ended:
+        first.train()
+    assert ended.value.code == 143
+    assert first._optim_count == step  # the step's own hooks were done, no other step was begun
+    assert "SIGTERM" in (said := capsys.readouterr().err)
+    assert "goes on from there" in said
+    second = build(tmp_path / "broken", out_dir=tmp_path / "broken", **options)
+    assert second.resume()
+    assert second._optim_count == step
+    second.train()
+    assert_same(weights(straight), weights(second))
+    logs = [(tmp_path / name / "log.jsonl").read_text() for name in ("straight", "broken")]
+    assert logs[0] == logs[1]
 
 
 def test_every_batch_leaves_a_line_in_the_log_and_a_loss_that_is_not_finite_stops(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from torch import Tensor
 from torchrl_sspl.certification.record import Record, count, finite, keys
 from torchrl_sspl.certification.rounding import LOWER_BOUNDS, missed
 from torchrl_sspl.errors import CertificationError
+from torchrl_sspl.files import write
 
 SCHEMA = 3
 #: What a statement is; what is reported has a number and no verdict, and what is assumed has neither.
@@ -274,9 +275,7 @@ class Certificate:
 
     def save(self, path: str | Path) -> Path:
         """Writes it as JSON; returns the path."""
-        path = Path(path)
-        path.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
-        return path
+        return write(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> Certificate:

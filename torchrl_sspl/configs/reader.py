@@ -24,6 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_sspl.configs.schema import _CHOICES, PRESETS, Config
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.files import write
 
 FOLDER = Path(__file__).parent
 #: Systems with recommended settings: the files of the folder "env".
@@ -253,10 +254,7 @@ def save(config: Config, path: str | Path) -> Path:
     path = Path(path)
     body = config.to_dict()
     text = json.dumps(body, indent=1) + "\n" if path.suffix == ".json" else OmegaConf.to_yaml(OmegaConf.create(body))
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    part.replace(path)
-    return path
+    return write(path, text)
 
 
 def load(path: str | Path) -> Config:

@@ -12,6 +12,7 @@ from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.configs.schema import Config
 from torchrl_sspl.envs.system import System
 from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
+from torchrl_sspl.files import write
 from torchrl_sspl.modules.agent import Agent
 
 METRICS_FILE = "metrics.json"
@@ -157,10 +158,10 @@ def write_metrics(outcome: Outcome) -> Path:
     text = json.dumps(_without_paths(body), indent=1, sort_keys=True) + "\n"
     path = Path(outcome.directory) / METRICS_FILE
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
+    write(path, text)
     beside = path.parent / "agent"
     if outcome.seconds is not None and beside.is_dir():
-        (beside / EVALUATION_FILE).write_text(text)
+        write(beside / EVALUATION_FILE, text)
     return path
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
-from pathlib import Path
+from functools import partial, wraps
 from typing import Any
 
 import torch
@@ -38,6 +38,8 @@ from torchrl_sspl.evaluation.outcome import Outcome, write_metrics
 from torchrl_sspl.evaluation.physics import evaluate_physics
 from torchrl_sspl.experiments.description import describe, differences
 from torchrl_sspl.experiments.guidance import advice, check_encoder, check_factory
+from torchrl_sspl.files import RunDirectory, write
+from torchrl_sspl.interrupts import interruptible
 from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.modules.agent import Agent, agent_directory, build_encoder, call_with, load
@@ -69,6 +71,17 @@ def agent_phases(config: Config, *, known: bool) -> list[Phase]:
         number, progress = s.rounds - 1 if s.enabled else 0, config.trainer.progress
         phases.append(PlaceLevel(number, episodes=e.episodes, horizon=e.horizon, envs=e.envs, progress=progress))
     return phases
+
+
+def _alone(method: Callable[..., Any]) -> Any:
+    """No other process writes to the directory meanwhile, and a signal says what it leaves behind."""
+
+    @wraps(method)
+    def wrapped(self: Experiment, **options: Any) -> Any:
+        with self._claim.held(), interruptible(lambda: "what is saved stays; the same command goes on from there"):
+            return method(self, **options)
+
+    return wrapped
 
 
 class Experiment:
@@ -108,8 +121,10 @@ class Experiment:
         torch.manual_seed(config.seed)
         self.encoder, self.dynamics, self.barrier, self.policy = self._networks()
         check_encoder(self.encoder, pixels.to(self.device), config.network.latent_dim)
-        self.directory = Path(config.out_dir)
-        self.directory.mkdir(parents=True, exist_ok=True)
+        pictures = config.trainer.total_frames * pixels.numel() // 2  # bytes: the store holds every frame once
+        keeps = 0 if config.trainer.checkpoint_seconds < 0 or config.agent else config.trainer.keep_checkpoints + 1
+        self._claim = RunDirectory(config.out_dir, needs=pictures * keeps)
+        self.directory = self._claim.path
         self.loss = self._loss(self.encoder, self.dynamics, self.barrier, self.policy)
         self.logger = make_logger(config.logger.kind, config.logger.kind, self.directory, project=config.logger.project)
         # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
@@ -256,15 +271,18 @@ class Experiment:
         options: dict[str, Any] = {"level": self.work.level, "gain": self.work.gain, "description": self.work.description}
         return Agent.from_networks(*nets, **options)
 
+    @_alone
     def train(self, *, resume: bool = True) -> Agent:
         """Train, or go on from the last checkpoint in the directory if ``resume``.
 
         Returns the agent; it is in ``agent/`` too. Raises CheckpointError if the directory holds a run of another
-        system, other networks or other settings; EmptyRegionError if S or U never occurs in the data. Source: paper,
-        Algorithm 1.
+        system, other networks or other settings; OutputError if another process writes there; EmptyRegionError if S or
+        U never occurs in the data. SIGINT and SIGTERM save the state and end the process. Source: paper, Algorithm 1.
         """
         rotation = self.trainer.checkpoint_rotation
         latest = rotation.latest() if rotation is not None else None
+        for half in (self.directory / "checkpoints").glob(".*"):  # of a killed run
+            shutil.rmtree(half, ignore_errors=True)
         if resume and latest is not None:
             self._same_run()
             self.trainer.resume()
@@ -272,7 +290,7 @@ class Experiment:
             for path in () if rotation is None else rotation.checkpoints():
                 rotation._remove_atomically(path)
             (self.directory / "log.jsonl").unlink(missing_ok=True)
-        (self.directory / CONFIG_FILE).write_text(json.dumps(self.config.to_dict(), indent=1, sort_keys=True) + "\n")
+        write(self.directory / CONFIG_FILE, json.dumps(self.config.to_dict(), indent=1, sort_keys=True) + "\n")
         try:
             self.trainer.train()
         except EmptyRegionError as error:
@@ -355,11 +373,13 @@ class Experiment:
         certificate.save(self.directory / "agent" / CERTIFICATE_FILE)
         return certificate
 
+    @_alone
     def run(self, *, resume: bool = True) -> Outcome:
         """Train (or load ``config.agent``), evaluate on fresh data, certify, and report.
 
         With ``resume`` a training goes on from a checkpoint in ``config.out_dir``, if there is one. There
-        ``metrics.json``, ``report.html`` and ``agent/`` land. Source: none.
+        ``metrics.json``, ``report.html`` and ``agent/`` land. Raises OutputError if another process writes there.
+        Source: none.
         """
         trained = not self.config.agent
         agent = (self.train(resume=resume) if trained else load(self.config.agent)).to(self.device)

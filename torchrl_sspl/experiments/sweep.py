@@ -25,6 +25,7 @@ from typing import Any
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.configs.schema import Config
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
+from torchrl_sspl.files import write
 from torchrl_sspl.viz.compare import Row, Run, compare, read_metrics, rows_of, text_table
 
 LAUNCHERS = ("local", "ray")
@@ -186,9 +187,7 @@ def _write(out: Sweep, overrides: Sequence[str]) -> None:
 
     runs = [{"name": t.name, "overrides": t.words[:-1], "status": t.status, "seconds": round(t.seconds, 1)} for t in out.tasks]
     body = {"schema": 1, "version": __version__, "overrides": list(overrides), "runs": runs, "table": [asdict(r) for r in out.rows]}
-    part = out.directory / "sweep.json.part"
-    part.write_text(json.dumps(body, indent=1) + "\n")
-    part.replace(out.directory / "sweep.json")
+    write(out.directory / "sweep.json", json.dumps(body, indent=1) + "\n")
 
 
 def _work(tasks: Sequence[Task], start: Callable[[Task], Any], jobs: int, received: list[int]) -> int:

@@ -13,12 +13,14 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as as_bytes
 from torch import Tensor, nn
 
 from torchrl_sspl.configs.reader import resolve
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.files import write
 from torchrl_sspl.lipschitz import prove_lipschitz
 from torchrl_sspl.modules.controller import Controller
 from torchrl_sspl.modules.export import export
@@ -201,9 +203,9 @@ class Agent(nn.Module):
             )
         path = Path(path)
         path.mkdir(parents=True, exist_ok=True)
-        save_file({k: v.contiguous() for k, v in self.state_dict().items()}, path / WEIGHTS_FILE)
+        write(path / WEIGHTS_FILE, as_bytes({k: v.contiguous() for k, v in self.state_dict().items()}))
         body = {"format": FORMAT_VERSION, "lipschitz_bound": self.lipschitz_bound, **self.description}
-        (path / DESCRIPTION_FILE).write_text(json.dumps(body, indent=1, sort_keys=True) + "\n")
+        write(path / DESCRIPTION_FILE, json.dumps(body, indent=1, sort_keys=True) + "\n")
         return path
 
     @classmethod

@@ -400,7 +400,7 @@ class Phases(TrainerHookBase):
             self.bar.refresh()
             if self.finished:
                 work.finish()
-            self._save()
+            self._save(force_save=True)  # what comes next may take long and have no steps
         if own_bar:
             self.bar.close()
 

@@ -78,6 +78,11 @@ class SSPLStepper(OptimizationStepper):
         self.warm_start_steps, self.warm_start_error = warm_start_steps, warm_start_error
         self.autocast, self.count = autocast, 0
         self.mislabelled = 2.0  # running mean of the two errors; both are 1 at worst
+        self.begin_batch()
+
+    def begin_batch(self) -> None:
+        """Steps on what was collected last, and the mean of their terms, begin at zero."""
+        self.inside, self.mean = 0, {}  # type: tuple[int, dict[str, Tensor]]
 
     @property
     def blind(self) -> bool:
@@ -110,7 +115,11 @@ class SSPLStepper(OptimizationStepper):
         if blind:  # only now: a GPU is waited for here
             self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
         extra = {"grad_norm": norm.detach(), "warm_start": torch.tensor(float(warm)), **self._lipschitz_step()}
-        return TensorDict({**dict(terms.detach().items()), **extra}, batch_size=[])
+        told = {**dict(terms.detach().items()), **extra}
+        n = self.inside
+        self.mean = {key: (self.mean[key] * n + value) / (n + 1) if n else value for key, value in told.items()}
+        self.inside += 1
+        return TensorDict(told, batch_size=[])
 
     def _clip(self, trainer: Trainer) -> Tensor:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
@@ -145,8 +154,9 @@ class SSPLStepper(OptimizationStepper):
         return {**dict(terms.detach().items()), "lipschitz_share": torch.tensor(share)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Counter, progress of the warm start, and both optimisers."""
+        """Counters, progress of the warm start, mean of the terms, and both optimisers."""
         state: dict[str, Any] = {"count": self.count, "mislabelled": self.mislabelled, "optimizer": self.optimizer.state_dict()}
+        state |= {"inside": self.inside, "mean": dict(self.mean)}
         if self.lipschitz_optimizer is not None:
             state["lipschitz_optimizer"] = self.lipschitz_optimizer.state_dict()
         return state
@@ -154,6 +164,7 @@ class SSPLStepper(OptimizationStepper):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
         self.count, self.mislabelled = int(state_dict["count"]), float(state_dict["mislabelled"])
+        self.inside, self.mean = int(state_dict.get("inside", 0)), dict(state_dict.get("mean", {}))
         self.optimizer.load_state_dict(state_dict["optimizer"])
         if self.lipschitz_optimizer is not None:
             self.lipschitz_optimizer.load_state_dict(state_dict["lipschitz_optimizer"])

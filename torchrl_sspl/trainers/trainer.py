@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from torchrl.objectives import SoftUpdate, TargetNetUpdater
 from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer, UpdateWeights
 from tqdm import tqdm
 
-from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError
+from torchrl_sspl.interrupts import end_if_pending, interruptible, pending, saving
 from torchrl_sspl.modules import make_rollout_policy
 from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
 from torchrl_sspl.trainers.hooks import ClockHook, EveryHook, FitEncoderHook, LogHook, MarginHook, SeedHook
@@ -67,7 +69,7 @@ class SSPLTrainer(Trainer):
             (a text) ends the training.
         draw, draw_every: ``trainer -> mapping of names to figures``, given to the logger after so many batches.
         checkpoint_dir: folder of the checkpoints; ``None`` for none.
-        checkpoint_seconds: seconds between checkpoints; 0 saves after every batch, and after every step of a phase.
+        checkpoint_seconds: seconds between checkpoints; 0 saves after every optimiser step.
         keep_checkpoints: number of checkpoints that are kept.
         autocast: dtype of mixed precision.
         phases: what follows when all transitions are collected.
@@ -122,7 +124,7 @@ class SSPLTrainer(Trainer):
         draw: Call | None = None,
         draw_every: int = 1,
         checkpoint_dir: str | os.PathLike[str] | None = None,
-        checkpoint_seconds: float = 0.0,
+        checkpoint_seconds: float = 30.0,
         keep_checkpoints: int = 2,
         autocast: torch.dtype | None = None,
         phases: Phases | None = None,
@@ -203,7 +205,14 @@ class SSPLTrainer(Trainer):
         self.register_op("post_optim", self._tick)
 
     def train(self) -> None:
-        """Train, or continue to train, to the end: the joint training, then the phases."""
+        """Train, or continue to train, to the end: the joint training, then the phases.
+
+        SIGINT and SIGTERM save the state and end the process with exit code 130 or 143.
+        """
+        with interruptible(self._saved), saving():
+            self._train()
+
+    def _train(self) -> None:
         self.clock.start()
         self._bar = tqdm(
             total=self._joint_steps() + (0 if self.phases is None else self.phases.steps), unit="step",
@@ -213,15 +222,59 @@ class SSPLTrainer(Trainer):
         if self.phases is not None:
             self.phases.bar = self._bar
         try:
-            if self.collected_frames < self.total_frames:
+            if self.optimization_stepper.inside:
+                self._finish_batch()
+            if self.collected_frames < self.total_frames and not self._stop_training:
                 super().train()
             else:
                 if self.phases is not None and not self.phases.finished:
                     self.phases.run()
                     self.save_trainer(force_save=True)
                 self.collector.shutdown()
+        except BaseException:
+            with suppress(Exception):
+                self.collector.shutdown()  # its processes would outlive an exception
+            raise
         finally:
             self._bar.close()
+
+    def _finish_batch(self) -> None:
+        """The steps on a collected batch that a checkpoint had cut in two, and what follows them."""
+        self.optim_steps(None)
+        self._post_steps_hook()
+        self._post_steps_log_hook(None)
+        self.save_trainer(force_save=self._stop_training)
+
+    def optim_steps(self, batch: Any) -> None:
+        """The steps on what was collected, or those that are missing; a checkpoint may lie between any two of them."""
+        stepper = self.optimization_stepper
+        whole = int(self.optim_steps_per_batch)  # type: ignore[has-type]
+        self._last_step, self.optim_steps_per_batch = whole * self.num_epochs, whole - stepper.inside
+        try:
+            super().optim_steps(batch)
+        finally:
+            self.optim_steps_per_batch = whole
+        stepper.begin_batch()
+
+    def _pre_optim_hook(self) -> None:
+        if not self.optimization_stepper.inside:  # once a batch
+            super()._pre_optim_hook()
+
+    def _post_optim_log(self, batch: Any) -> None:
+        super()._post_optim_log(batch)
+        if self.num_epochs == 1 and self.optimization_stepper.inside < self._last_step:
+            self.save_trainer()
+
+    def _post_optim_complete_log_hook(self, optim_steps: int, average_losses: Any) -> None:
+        # Of the steps before an interruption the trainer's own mean knows nothing.
+        super()._post_optim_complete_log_hook(optim_steps, TensorDict(self.optimization_stepper.mean))
+
+    def _saved(self) -> str:
+        """Where a run goes on."""
+        rotation = self.checkpoint_rotation
+        if rotation is None or rotation.latest() is None:
+            return "nothing was saved"
+        return f"the state is in {rotation.latest()}; the same command goes on from there"
 
     def _joint_steps(self) -> int:
         """Optimiser steps of the joint training, in all."""
@@ -239,12 +292,13 @@ class SSPLTrainer(Trainer):
         return {}
 
     def save_trainer(self, force_save: bool = False) -> None:
-        """Save when ``checkpoint_seconds`` have passed since the last checkpoint, or when it is asked for."""
-        if not self._has_checkpoint_destination():
-            return
-        if force_save or time.monotonic() - self._saved_at >= self.checkpoint_seconds:
+        """Save when ``checkpoint_seconds`` have passed since the last checkpoint, when it is asked for, or at a signal."""
+        if self._has_checkpoint_destination() and (
+            force_save or pending() or time.monotonic() - self._saved_at >= self.checkpoint_seconds
+        ):
             self._save_trainer()
             self._saved_at = time.monotonic()
+        end_if_pending()
 
     def _save_trainer(self) -> None:
         """Write a checkpoint; inside the phases without the pictures, which are not needed any more."""
@@ -253,9 +307,16 @@ class SSPLTrainer(Trainer):
         checkpoint = self._sync_checkpoint_components()
         inside = self.phases is not None and self.phases.begun
         names = [name for name in checkpoint.components if not (inside and name in _PICTURES)]
-        step = self.collected_frames + (self.phases.steps_done + self.phases.done if inside else 0)  # type: ignore[union-attr]
+        step = self.collected_frames + self._optim_count
+        step += self.phases.steps_done + self.phases.done if inside else 0  # type: ignore[union-attr]
         metadata = self._checkpoint_manifest_metadata()
-        self.checkpoint_rotation.save(checkpoint, step=step, components=names, metadata=metadata)
+        try:
+            self.checkpoint_rotation.save(checkpoint, step=step, components=names, metadata=metadata)
+        except OSError as error:
+            raise OutputError(
+                f"expected to write a checkpoint to '{self.checkpoint_rotation.directory}', received {error.strerror or error}; "
+                f"make room or repair it: {self._saved()}"
+            ) from error
         return None
 
     def resume(self) -> bool:

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.files import write
 from torchrl_sspl.viz.report_style import CSS
 
 _NOT_MEASURED = "not measured"
@@ -335,7 +336,6 @@ def write_page(path: str | Path, title: str, facts: str, body: str, css: str = "
     """Write, whole or not at all, a page with a title, a line of facts, a body that is HTML, and further styles."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    part = path.with_name(path.name + ".part")
     page = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -343,8 +343,7 @@ def write_page(path: str | Path, title: str, facts: str, body: str, css: str = "
         f"<title>{escape(title)}</title><style>{CSS}{css}</style></head><body><main><header><h1>{escape(title)}</h1>"
         f"<p class='facts'>{escape(facts)}</p></header>{body}</main></body></html>\n"
     )
-    part.write_text(page, encoding="utf-8")
-    return part.replace(path)
+    return write(path, page)
 
 
 def _verdict(text: str, kind: str, proved: Sequence[str], measured: Sequence[str], assumed: Sequence[str]) -> str:
