@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data.replay_buffers.samplers import PrioritizedSampler
 
 from torchrl_sspl.data import RegionSampler, TransitionStore
 from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, EmptyRegionError, ShapeError
@@ -273,3 +274,18 @@ def test_empty_sets_and_bad_shares_are_named():
         store.sample(4, safe=0.7, unsafe=0.7)
     with pytest.raises(ConfigError, match="sum <= 1"):
         RegionSampler(-0.1, 0.2)
+
+
+def test_prioritised_replay_draws_what_the_losses_find_hard():
+    prioritized = pytest.importorskip("torchrl.data.replay_buffers.samplers.prioritized")
+    if getattr(prioritized, "SumSegmentTreeFp32", None) is None:
+        pytest.skip("torchrl's extension does not load with this torch: 2.14 or newer")
+    buffer = TransitionStore(100).replay_buffer(200, sampler=PrioritizedSampler(100, alpha=1.0, beta=1.0))
+    buffer.extend(episode(10))
+    batch = buffer.sample()
+    assert batch.get("priority_weight") is not None
+    hard = torch.full((200,), 1e-6)
+    hard[batch["index"].flatten() == 3] = 10.0
+    buffer.update_priority(batch["index"].flatten(), hard)
+    drawn = buffer.sample()["action"].flatten()
+    assert (drawn == 3).float().mean() > 0.9

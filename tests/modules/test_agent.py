@@ -359,3 +359,24 @@ def test_an_agent_written_by_a_program_names_the_programs_file(own_module, tmp_p
     agent = Agent.load(tmp_path / "agent")
     assert agent.description["networks"]["encoder"]["class"] == "my_networks:Outer.Encoder"
     assert agent.act(torch.zeros(2, 6, 16, 16, dtype=torch.uint8))[0].shape == (2, 1)
+
+
+def test_the_constructor_and_from_loss_leave_a_training_alone():
+    salad, policy = SaLaD.from_sizes(2, 1, action_scale=10.0, pool_to=8), Policy(2, 1, action_scale=10.0)
+    encoder, dynamics, barrier = salad
+    agent = Agent(encoder, dynamics, mlp_barrier(2, [8]), policy, 2.0)
+    loss = SSPLLoss(encoder, dynamics, barrier, policy)
+    Agent.from_loss(loss)
+    networks = [getattr(net, "module", net) for net in (encoder, dynamics, barrier, policy)]
+    assert all(p.requires_grad for net in networks for p in net.parameters())
+    assert all(net.training for net in networks)
+    before = agent.policy(torch.zeros(1, 2))
+    with torch.no_grad():
+        next(policy.parameters()).add_(1.0)
+    assert torch.equal(agent.policy(torch.zeros(1, 2)), before)
+    assert not any(p.requires_grad for p in agent.parameters())
+
+
+def test_a_barrier_in_training_is_named_and_where_it_belongs():
+    with pytest.raises(ConfigError, match=r"plain barrier.*received SandwichBarrier; Agent\.from_networks"):
+        Agent(FrameEncoder(2, 32), LatentDynamics(2, 1), SandwichBarrier(2, (8,)), Policy(2, 1), 2.0)

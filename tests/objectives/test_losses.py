@@ -467,3 +467,28 @@ def test_dynamics_and_policy_in_other_units_are_refused() -> None:
     SSPLLoss(*salad, Policy(3, 1, action_scale=10.0))
     with pytest.raises(ConfigError, match=r"one action_scale .* received \[10.0\] and \[1.0\]"):
         SSPLLoss(*salad, Policy(3, 1, action_scale=1.0))
+
+
+def small_batch(**extra: Tensor) -> TensorDict:
+    base = {"latent": torch.rand(4, 2), "action": torch.zeros(4, 3), "region": torch.zeros(4, 1, dtype=torch.int64)}
+    return TensorDict({**base, **extra}, batch_size=4)
+
+
+def test_an_actor_that_gets_no_gradient_is_refused() -> None:
+    class Argmax(nn.Linear):
+        def forward(self, latent: Tensor) -> Tensor:
+            return nn.functional.one_hot(super().forward(latent).argmax(-1), 3).float()
+
+    loss = SynthesisLoss(None, LatentDynamics(2, 3), SandwichBarrier(2, (8,)), Argmax(2, 3))
+    with pytest.raises(ConfigError, match="actions carry a gradient"):
+        loss(small_batch())
+    with torch.no_grad():
+        loss(small_batch())  # to look at
+
+
+def test_region_codes_outside_the_table_are_named() -> None:
+    loss = SaLaDLoss(None, LatentDynamics(2, 3), SandwichBarrier(2, (8,)), consistency="online")
+    codes = torch.tensor([[0], [1], [2], [7]])
+    after = TensorDict(latent=torch.rand(4, 2), batch_size=4)
+    with pytest.raises(ConfigError, match=r"received \[7\]"):
+        loss(small_batch(region=codes).set("next", after))

@@ -211,12 +211,11 @@ class TransitionStore(Storage):
     ) -> TensorDictReplayBuffer:
         """This store as a TorchRL replay buffer with stratified batches, see ``RegionSampler``.
 
-        Further arguments are those of ``TensorDictReplayBuffer``, such as ``prefetch`` or ``generator``.
+        Further arguments are those of ``TensorDictReplayBuffer``, such as ``prefetch`` or ``generator``; a ``sampler`` of
+        TorchRL, such as ``PrioritizedSampler``, takes the place of the stratified one.
         """
-        made = TensorDictReplayBuffer(
-            storage=self, sampler=RegionSampler(safe, unsafe), writer=RoundRobinWriter(), collate_fn=_as_it_is,
-            batch_size=batch_size, **buffer,
-        )  # fmt: skip
+        buffer = {"sampler": RegionSampler(safe, unsafe), "writer": RoundRobinWriter(), "collate_fn": _as_it_is, **buffer}
+        made = TensorDictReplayBuffer(storage=self, batch_size=batch_size, **buffer)
         made.writer._cursor = self._cursor  # go on behind what the store holds already
         return made
 

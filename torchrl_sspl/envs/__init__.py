@@ -5,11 +5,12 @@ from __future__ import annotations
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
-from torchrl_sspl.envs.pendulum import PendulumEnv
+from torchrl_sspl.envs.pendulum import PendulumEnv as PendulumEnv  # not in __all__: TorchRL has one too
+from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
 from torchrl_sspl.envs.system import Requirement, System
 
 __all__ = [
-    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "PendulumEnv", "PendulumRenderer", "Requirement", "SafetyEnv",
-    "System",
+    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "PendulumRenderer", "PixelPendulumEnv", "Requirement",
+    "SafetyEnv", "System",
 ]  # fmt: skip

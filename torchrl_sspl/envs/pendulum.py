@@ -34,7 +34,7 @@ SYSTEM = System(
 )
 
 
-class PendulumEnv(SafetyEnv):
+class PixelPendulumEnv(SafetyEnv):
     r"""Batched torque-driven pendulum with two stacked RGB frames as observation.
 
     With the angle theta (0 upright, positive counter-clockwise) and the torque u, one step is
@@ -68,7 +68,7 @@ class PendulumEnv(SafetyEnv):
     unsafe set share states. Source: paper, Section V-A. Deviation: the semi-implicit step is the default (see above).
 
     Example:
-        >>> env = PendulumEnv(batch_size=[2], seed=0)
+        >>> env = PixelPendulumEnv(batch_size=[2], seed=0)
         >>> env.dynamics(torch.tensor([[0.0, 1.0]]), torch.tensor([[10.0]]))
         tensor([[0.0750, 1.5000]])
         >>> rollout = env.rollout(3, break_when_any_done=False)
@@ -170,3 +170,7 @@ class PendulumEnv(SafetyEnv):
 def _gymnasium_renderer(image_size: int) -> GymnasiumRenderer:
     """One table of gymnasium's pictures per frame size, shared by all environments of the process."""
     return GymnasiumRenderer(image_size)
+
+
+PendulumEnv = PixelPendulumEnv
+"""The same; TorchRL has a PendulumEnv of its own."""

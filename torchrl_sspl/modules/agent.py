@@ -52,7 +52,8 @@ POLICIES: dict[str, type[nn.Module]] = {"Policy": Policy}
 class Agent(nn.Module):
     r"""A frozen safe agent: :math:`z = E(o)`, :math:`B(z)`, :math:`u = \pi(z)`, :math:`z^+ = d(z, u)`.
 
-    The networks are in evaluation mode and take no gradient. ``barrier``, ``policy`` and ``dynamics`` are
+    The networks are copies, in evaluation mode, and take no gradient; those that are given stay as they are
+    (TensorDictModules are unwrapped). ``barrier``, ``policy`` and ``dynamics`` are
     modules and are called as such; :meth:`controller` runs them behind the observer. Source: paper Section IV (the
     trained networks); deviation: the latent observer, see :class:`~torchrl_sspl.modules.observer.LatentObserver`.
 
@@ -66,7 +67,7 @@ class Agent(nn.Module):
             ``"tolerated_error"`` is the error below which its proof applies at run time.
         gain: K of the latent observer, a number or ``(p, p)``; 1: the latent is what is seen.
 
-    Raises ConfigError for a gain or a tolerated error that is not valid.
+    Raises ConfigError for a barrier in training, or a gain or a tolerated error that is not valid.
 
     Example:
         >>> agent = Agent(FrameEncoder(2, 32), LatentDynamics(2, 1), mlp_barrier(2, [8]), Policy(2, 1), 2.0)
@@ -88,7 +89,14 @@ class Agent(nn.Module):
         gain: float | Tensor = 1.0,
     ) -> None:
         super().__init__()
-        self.encoder, self.dynamics, self.barrier, self.policy = encoder, dynamics, barrier, policy
+        # Copies: a training that goes on does not notice, and does not change what is deployed.
+        nets = (copy.deepcopy(getattr(net, "module", net)) for net in (encoder, dynamics, barrier, policy))
+        self.encoder, self.dynamics, self.barrier, self.policy = nets
+        if not isinstance(self.barrier, nn.Sequential) or not hasattr(self.barrier[0], "in_features"):
+            raise ConfigError(
+                f"expected a plain barrier (a Sequential that begins with a Linear), received {type(self.barrier).__name__}; "
+                "Agent.from_networks(...) and Agent.from_loss(loss) collapse it and prove its Lipschitz bound"
+            )
         self.lipschitz_bound = float(lipschitz_bound)
         self.description: dict[str, Any] = dict(description or {})
         self.register_buffer("gain", gain_matrix(gain, self.latent_dim))

@@ -109,6 +109,6 @@ class ActionValueLoss(LatentLoss):
 
     def terms(self, batch: LatentBatch, table: Tensor) -> dict[str, Tensor]:
         """The same for latents that have been read: what a loop of thousands of small steps calls."""
-        action = self._run("actor_network", batch.latent)
+        action = self._action(batch.latent)
         short = table.amax(-1, keepdim=True) - interpolate(table, action, action_scale=self.action_scale)
         return {"loss_action_value": self._reduce(short / self.scale, batch, worst=True)}

@@ -322,6 +322,18 @@ class LatentLoss(LossModule):
         self._out_keys_apparent = list(out_keys)
         return self
 
+    def _action(self, latent: Tensor) -> Tensor:
+        """Actions of the policy in training; one that cannot be trained this way is refused."""
+        action = self._run("actor_network", latent)
+        if action.requires_grad or not torch.is_grad_enabled() or is_compiling():
+            return action
+        if any(p.requires_grad for p in self.actor_network_params.parameters()):
+            raise ConfigError(
+                "expected an actor whose actions carry a gradient to its weights, received one without (an argmax, or samples of a "
+                "discrete distribution); give it a deterministic or reparameterised one: actions pass through the dynamics"
+            )
+        return action
+
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
         network = getattr(self, name)
@@ -421,6 +433,9 @@ class LatentLoss(LossModule):
                     f"expected {keys.region!r} of dtype torch.int64 (0 unlabelled, 1 safe, 2 unsafe), "
                     f"received {batch.region.dtype}; use sets.label"
                 )
+            if not is_compiling() and batch.region.device.type == "cpu" and ((batch.region < 0) | (batch.region > 2)).any():
+                codes = sorted({*batch.region.flatten().tolist()} - {0, 1, 2})
+                raise ConfigError(f"expected region codes 0 unlabelled, 1 safe, 2 unsafe, received {codes[:5]}; use sets.label")
             if batch.region.shape != (*batch.shape, 1):
                 raise ShapeError(
                     f"expected {keys.region!r} of shape {(*batch.shape, 1)}, received "

@@ -76,7 +76,7 @@ class PolicyDeviationLoss(LatentLoss):
 
     def _deviation_terms(self, batch: LatentBatch) -> dict[str, Tensor]:
         latent = batch.latent.detach() if "encoder" in self.detach else batch.latent
-        action = self._run("actor_network", latent)
+        action = self._action(latent)
         user = torch.zeros_like(action) if batch.user_action is None else batch.user_action
         return {"loss_policy_deviation": self._reduce(policy_deviation(action, user), batch)}
 

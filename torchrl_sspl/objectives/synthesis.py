@@ -157,7 +157,7 @@ class SynthesisLoss(LatentLoss):
         if stray:
             uniform = torch.rand_like(latent) * 2.0 - 1.0
             origin, at = torch.stack([latent, uniform]), torch.stack([start, uniform])
-        action = self._run("actor_network", origin)
+        action = self._action(origin)
         successor = self._run("dynamics", at, action, params="frozen" if "dynamics" in self.detach else "online")
         if batch.residual is not None:
             # Uniform latents have no observed error.
@@ -184,7 +184,7 @@ class SynthesisLoss(LatentLoss):
             terms["loss_growth"] = self.growth_coeff * self._reduce(grow, batch)
         if "descent_coeff" in self._active:
             still = latent.detach()
-            ahead = self._run("dynamics", still, self._run("actor_network", still), params="frozen")
+            ahead = self._run("dynamics", still, self._action(still), params="frozen")
             weight = (-barrier.detach().clamp_min(0.0) / self.descent_scale).exp()
             descent = weight * self._run("barrier", ahead, params="frozen")
             terms["loss_descent"] = self.descent_coeff * self._reduce(descent, batch)

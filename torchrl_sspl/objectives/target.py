@@ -108,7 +108,7 @@ class TargetLoss(LatentLoss):
         residual = (barrier - target).square() * self.inside_coeff
         near = (-target.abs() / self.scale).exp() + 0.1
         fit = near * residual.where(inside, short.square())
-        action = self._run("actor_network", batch.latent)
+        action = self._action(batch.latent)
         wanted = self._counted(tensordict, keys.action_target, "action_target", batch)
         gap = (action - wanted) / self.action_scale
         weight = self._counted(tensordict, keys.action_weight, "action_weight", batch)
