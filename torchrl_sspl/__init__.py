@@ -49,6 +49,7 @@ _NAMES = {
     "Certificate": "certification.certificate",
     "SafetyFilter": "runtime",
     "SafetyWrapper": "runtime",
+    "SafetyVectorWrapper": "runtime",
     "Monitor": "runtime",
     "calibrate": "runtime",
 }
