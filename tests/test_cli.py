@@ -35,10 +35,10 @@ def test_usage_version_and_unknown_commands(capsys):
     assert torchrl_sspl.__version__ in capsys.readouterr().out
     assert cli.main(["--help"]) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("train", "evaluate", "verify", "compare"))
+    assert all(word in shown for word in ("train", "evaluate", "verify", "compare", "watch"))
     assert cli.main([]) == 2
     assert cli.main(["trian"]) == 2
-    assert "one of train, evaluate, verify, compare, received 'trian'" in capsys.readouterr().err
+    assert "one of train, evaluate, verify, compare, watch, received 'trian'" in capsys.readouterr().err
 
 
 def test_python_m_is_the_same_command():

@@ -1,4 +1,4 @@
-"""The command ``sspl``: train, evaluate, verify, compare."""
+"""The command ``sspl``: train, evaluate, verify, compare, watch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ _USAGE = """sspl COMMAND ...
   train     train an agent, evaluate it and write its report; `sspl train --help` lists every field
   evaluate  measure an agent again, on fresh data
   verify    check the certificates of an agent again
-  compare   a page with several runs beside each other"""
+  compare   a page with several runs beside each other
+  watch     see an agent at work: picture, barrier, verdict, interventions"""
 _TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
 
 Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Started again with
@@ -56,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    commands = {"train": _train, "evaluate": _evaluate, "verify": _verify, "compare": _compare}
+    commands = {"train": _train, "evaluate": _evaluate, "verify": _verify, "compare": _compare, "watch": _watch}
     if words[:1] == ["--version"]:
         from torchrl_sspl import __version__
 
@@ -237,4 +238,30 @@ def _compare(words: list[str]) -> int:
     path = page.compare(runs, options.out or Path(beside) / "comparison.html")
     print(page.text_table(page.rows_of(runs)))
     print(f"comparison: {path}")
+    return 0
+
+
+def _watch(words: list[str]) -> int:
+    """Show an agent at work on a page that is served from this machine."""
+    parser = argparse.ArgumentParser(prog="sspl watch", description="See an agent at work, on a page served from this machine.")
+    parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory with a calibration")
+    parser.add_argument("--env", help="a system as in `sspl train env=...`, or physics: its own one in full physics; default: its own one")
+    parser.add_argument("--video", metavar="FILE", help="a film in place of a system")
+    parser.add_argument("--policy", choices=("own", "random"), default="own", help="what acts (default: own)")
+    parser.add_argument("--filter", action="store_true", help="put the safety filter behind it")
+    parser.add_argument("--record", metavar="FILE.mp4", help="write a film of it")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the page; another one than 127.0.0.1 shows it to others")
+    parser.add_argument("--port", type=int, default=8000, help="its port, 0: any that is free (default: 8000)")
+    parser.add_argument("--steps", type=int, help="end after so many; default: with Ctrl-C")
+    parser.add_argument("--fps", type=float, help="steps per second; default: those of the system or the film")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    given = parser.parse_args(words)
+    from torchrl_sspl.viz.live import watch
+
+    counts = watch(
+        given.agent, env=given.env, video=given.video, policy=given.policy, protect=given.filter, record=given.record,
+        host=given.host, port=given.port, steps=given.steps, fps=given.fps, seed=given.seed,
+        ready=lambda address: print(f"{address}  (Ctrl-C ends it)", flush=True),
+    )  # fmt: skip
+    print("  ".join(f"{name} {value}" for name, value in counts.items()))
     return 0
