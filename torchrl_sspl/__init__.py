@@ -48,8 +48,8 @@ _NAMES = {
     "certify": "evaluation.certify",
     "Certificate": "certification.certificate",
     "SafetyFilter": "runtime",
-    "SafetyWrapper": "runtime",
     "SafetyVectorWrapper": "runtime",
+    "SafetyWrapper": "runtime",
     "Monitor": "runtime",
     "calibrate": "runtime",
 }

@@ -83,7 +83,8 @@ def watch(
     Args:
         name: shipped agent, or run directory with a calibration.
         env: a system as in ``sspl train env=...``, or ``"physics"``: the agent's own one in full physics; default: the agent's own one.
-        video: film file in place of a system; nothing is done there, so that every step is a surprise where the agent would have acted.
+        video: film file in place of a system; nothing can be done there, so that what happens is not
+            what the agent expects of its own actions.
         policy: ``"own"``, or ``"random"``: uniform actions, each held for five steps on average.
         protect: put the safety filter behind the policy; the margin of an agent without a proof is .02.
         record: an .mp4 file to write.
@@ -252,15 +253,16 @@ class _Loop:
 
     def run(self, steps: int | None) -> Iterator[tuple[dict[str, Any], NDArray[np.uint8]]]:
         """What happens at every step, and the frame ``(H, W, 3)`` that is seen."""
-        shown = next(self.source, None)
-        while shown is not None and (steps is None or self.counts["steps"] < steps):
-            action, event = self._step(shown)
-            yield event, shown.pixels[0, 3:].permute(1, 2, 0).numpy()
-            try:
+        try:
+            shown = next(self.source, None)
+            while shown is not None and (steps is None or self.counts["steps"] < steps):
+                action, event = self._step(shown)
+                yield event, shown.pixels[0, 3:].permute(1, 2, 0).numpy()
                 shown = self.source.send(action)
-            except StopIteration:
-                shown = None
-        self.source.close()
+        except StopIteration:
+            pass  # the film is over
+        finally:
+            self.source.close()
 
     def _step(self, shown: Shown) -> tuple[Tensor, dict[str, Any]]:
         if shown.begins:
@@ -299,7 +301,7 @@ class _Loop:
         if int(out.verdict) == Verdict.INSIDE:
             why = "nothing is proved of this agent" if not self.monitor.agent.tolerated_error > 0.0 else f"not met for {self.missed} steps"
             return f"B = {float(out.barrier):+.3f} <= 0; {why}"
-        seen = "the first picture" if math.isnan(value) else f"surprise {value:.3f} of at most {limits['innovation'][1]:.3f}"
+        seen = "the first picture" if math.isnan(value) else f"innovation {value:.3f} of at most {limits['innovation'][1]:.3f}"
         return f"B = {float(out.barrier):+.3f} <= 0; {seen}"
 
     def _beyond(self, name: str, out: Watched) -> str:
@@ -351,7 +353,8 @@ class Feed:
         read = 0
         while True:
             with self._changed:
-                self._changed.wait_for(lambda: self._count > read or not self._open)
+                while self._count == read and self._open:
+                    self._changed.wait()
                 new = list(self._recent)[-(self._count - read) :] if self._count > read else []
                 read, ended, picture = self._count, not self._open, self._picture
             yield from new[:-1]

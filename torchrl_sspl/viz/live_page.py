@@ -20,7 +20,8 @@ section{background:var(--card);border:1px solid var(--line);border-radius:10px;p
 .verdict h2{margin:0;font-size:1.5rem;line-height:1.25;color:var(--shown,var(--soft))}
 .verdict p{margin:.2rem 0 0;overflow-wrap:anywhere;font-variant-numeric:tabular-nums}
 h3{font-size:.9rem;font-weight:600;color:var(--soft);margin:0 0 .5rem}
-img{display:block;width:100%;max-width:380px;aspect-ratio:1;margin:0 auto;image-rendering:pixelated;border-radius:6px;background:var(--line)}
+img{display:block;width:100%;max-width:380px;aspect-ratio:1;margin:0 auto;image-rendering:pixelated;border-radius:6px;background:var(--line);
+border:1px solid var(--line)}
 dl{display:grid;grid-template-columns:repeat(auto-fit,minmax(130px,1fr));gap:.6rem 1rem;margin:0;font-variant-numeric:tabular-nums}
 dt{color:var(--soft);font-size:.82rem}dd{margin:0;font-size:1.05rem;overflow-wrap:anywhere}
 canvas{display:block;width:100%;height:200px;flex:1}
