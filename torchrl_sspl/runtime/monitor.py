@@ -2,6 +2,7 @@ r"""The monitor: what an agent knows at every step, and an alarm where its pictu
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -413,6 +414,7 @@ def calibrate(
 
     Raises ConfigError if no start lies in the set. Source: none.
     """
+    agent = copy.deepcopy(agent).cpu()  # where the system is
     g = torch.Generator().manual_seed(spawn(seed, "monitor", 0))
     with torch.random.fork_rng():
         torch.manual_seed(spawn(seed, "monitor", 1))
