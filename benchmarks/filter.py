@@ -1,6 +1,6 @@
 """The safety filter: episodes that enter U under random, adversarial and safe actions, with it and without.
 
-Run: python benchmarks/filter.py [AGENT] [EPISODES] [LEVEL ...] [--margin M] [--only ACTIONS] [--physics]
+Run: python benchmarks/filter.py [AGENT] [EPISODES] [LEVEL ...] [--margin M] [--noise N] [--only ACTIONS] [--physics]
 Prints a table in Markdown. Episodes have 200 steps and start in {B <= 0}, drawn with a seed of their own; with --physics they are walks
 of the quadruped in PyBullet. An agent without a proof gets the margin --margin, .02 by default.
 """
@@ -81,7 +81,18 @@ def towards_obstacle(env: Any, state: Tensor, held: Tensor, generator: torch.Gen
 ADVERSARIAL = {"pendulum": away_from_upright, "quadruped": towards_obstacle}
 
 
-def on_known_dynamics(agent: Any, env: Any, start: Tensor, wants: Any, shield: Shield | None) -> tuple[Episodes, str]:
+def noisy(draw: Any, noise: float) -> Any:
+    """What draws states, seen by a camera with a noise of some grey levels."""
+    generator = torch.Generator().manual_seed(SEED + 2)
+
+    def drawn(state: Tensor) -> Tensor:
+        frame = draw(state).float()
+        return (frame + noise * torch.randn(frame.shape, generator=generator)).round().clamp(0, 255).to(torch.uint8)
+
+    return drawn if noise > 0.0 else draw
+
+
+def on_known_dynamics(agent: Any, env: Any, draw: Any, start: Tensor, wants: Any, shield: Shield | None) -> tuple[Episodes, str]:
     """Episodes side by side, and the share of steps with an intervention with the mean deviation."""
     made: list[Protected] = []
 
@@ -91,12 +102,12 @@ def on_known_dynamics(agent: Any, env: Any, start: Tensor, wants: Any, shield: S
         return made[-1].action
 
     acts = AgentController(agent, None if wants is None else Driver(wants, env), None if shield is None else change)
-    run = simulate(acts, env, start=start, horizon=STEPS, label="episodes" if sys.stderr.isatty() else None)
+    run = simulate(acts, env, start=start, horizon=STEPS, draw=draw, label="episodes" if sys.stderr.isatty() else None)
     if not made:
         return run, "- | -"
     there = run.alive[1 : len(made) + 1]  # whoever left is asked for nothing
     changed, moved = (torch.stack([getattr(m, k) for m in made])[: len(there)][there].float().mean() for k in ("intervened", "deviation"))
-    return run, f"{100 * float(changed):.2g} % | {float(moved):.2g}"
+    return run, f"{100 * float(changed):.3g} % | {float(moved):.2g}"
 
 
 def in_physics(agent: Any, env: Any, start: Tensor, wants: Any, options: dict[str, Any] | None) -> tuple[Episodes, str]:
@@ -109,7 +120,7 @@ def in_physics(agent: Any, env: Any, start: Tensor, wants: Any, options: dict[st
     world.close()
     if told is None:
         return run, "- | -"
-    return run, f"{100 * told['interventions'] / told['steps']:.2g} % | {told['deviation'] / told['steps']:.2g}"
+    return run, f"{100 * told['interventions'] / told['steps']:.3g} % | {told['deviation'] / told['steps']:.2g}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -119,6 +130,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("episodes", nargs="?", type=int, default=1000)
     parser.add_argument("levels", nargs="*", type=float, default=[])
     parser.add_argument("--margin", type=float, help="in place of the proved one")
+    parser.add_argument("--noise", type=float, default=0.0, help="of the camera, grey levels; not in physics")
     parser.add_argument("--only", help="random, adversarial or own")
     parser.add_argument("--physics", action="store_true", help="walks in full physics")
     given = parser.parse_args(arguments)
@@ -138,7 +150,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if given.physics:
                 run, told = in_physics(agent, env, start, wants, options)
             else:
-                run, told = on_known_dynamics(agent, env, start, wants, None if options is None else Shield(agent, **options))
+                shield = None if options is None else Shield(agent, **options)
+                run, told = on_known_dynamics(agent, env, noisy(env.draw, given.noise), start, wants, shield)
             entered = int(((run.region == UNSAFE) & run.alive).any(0).sum())
             hit, fallen = (int(run.events[k].sum()) if k in run.events else "-" for k in ("hit", "fallen"))
             name = "none" if options is None else f"level {level:g}" + ("" if margin is None else f", margin {margin:g}")

@@ -259,13 +259,14 @@ def _watch(words: list[str]) -> int:
     parser.add_argument("--port", type=int, default=8000, help="its port, 0: any that is free (default: 8000)")
     parser.add_argument("--steps", type=int, help="end after so many; default: with Ctrl-C")
     parser.add_argument("--fps", type=float, help="steps per second; default: those of the system or the film")
+    parser.add_argument("--noise", type=float, default=1.0, help="of a system's camera, grey levels (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
     given = parser.parse_args(words)
     from torchrl_sspl.viz.live import watch
 
     counts = watch(
         given.agent, env=given.env, video=given.video, policy=given.policy, protect=given.filter, record=given.record,
-        host=given.host, port=given.port, steps=given.steps, fps=given.fps, seed=given.seed,
+        host=given.host, port=given.port, steps=given.steps, fps=given.fps, noise=given.noise, seed=given.seed,
         ready=lambda address: print(f"{address}  (Ctrl-C ends it)", flush=True),
     )  # fmt: skip
     print("  ".join(f"{name} {value}" for name, value in counts.items()))

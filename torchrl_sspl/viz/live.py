@@ -38,7 +38,6 @@ PHYSICS = "physics"
 _UNPROVED_MARGIN = 0.02
 _KEPT = 300  # steps that whoever opens the page is shown at once
 _STARTS, _HORIZON, _HELD = 32, 200, 0.2  # starts that are taken in turn, longest episode, chance of a new random action
-_NOISE = 1.0  # grey levels, of the camera: shipped calibrations suppose it
 _WIDTH, _HEIGHT = 768, 432
 #: What verdicts are called, and their colours in a film.
 VERDICTS = {
@@ -73,6 +72,7 @@ def watch(
     port: int = 8000,
     steps: int | None = None,
     fps: float | None = None,
+    noise: float = 1.0,
     seed: int = 0,
     ready: Callable[[str], Any] = print,
 ) -> dict[str, int]:
@@ -91,6 +91,7 @@ def watch(
         host, port: where the page is served; port 0: any that is free.
         steps: after so many it ends; None: it goes on.
         fps: steps per second; None: as fast as the system itself, or the film; ``inf``: as fast as possible.
+        noise: of the camera of a system, standard deviation in grey levels; shipped calibrations suppose one.
         seed: of all that is drawn.
         ready: called with the page's address.
 
@@ -98,15 +99,15 @@ def watch(
     arguments that are not valid, a port that is taken or a film that cannot be read; CheckpointError without a calibration;
     MissingDependencyError without the extra ``viz``.
     """
-    _check(env, video, policy, protect, record, port, steps, fps)
+    _check(env, video, policy, protect, record, port, steps, fps, noise)
     monitor = Monitor.load(name)
     agent = monitor.agent
     shield = Shield(agent, margin=None if agent.tolerated_error > 0.0 else _UNPROVED_MARGIN) if protect else None
     if video is None:
-        source, pace = _of_system(agent, env, seed)
+        source, pace = _of_system(agent, env, noise, seed)
     else:
         source, pace = _of_film(Path(video), _size(agent))
-    where = "film" if video is not None else env or "its own system"
+    where = "a film" if video is not None else {None: "its own system", PHYSICS: "full physics"}.get(env, env)
     about = f"{where}; {'random actions' if policy == 'random' else 'its own actions'}; safety filter {'on' if protect else 'off'}"
     loop = _Loop(monitor, shield, source, policy == "random", seed)
     feed = Feed()
@@ -135,12 +136,14 @@ def watch(
 
 def _check(
     env: str | None, video: str | Path | None, policy: str, protect: bool, record: str | Path | None, port: int,
-    steps: int | None, fps: float | None,
+    steps: int | None, fps: float | None, noise: float,
 ) -> None:  # fmt: skip
     """A ConfigError for arguments that are not valid."""
-    if policy not in POLICIES or not 0 <= port <= 65535 or (steps is not None and steps < 1) or (fps is not None and not fps > 0.0):
+    wrong = (steps is not None and steps < 1) or (fps is not None and not fps > 0.0) or not 0.0 <= noise < math.inf
+    if policy not in POLICIES or not 0 <= port <= 65535 or wrong:
         raise ConfigError(
-            f"expected policy in {POLICIES}, port in 0..65535, steps >= 1 and fps > 0, received {policy!r}, {port}, {steps} and {fps}"
+            f"expected policy in {POLICIES}, port in 0..65535, steps >= 1, fps > 0 and noise >= 0, received {policy!r}, {port}, {steps}, "
+            f"{fps} and {noise}"
         )
     if video is not None and (env is not None or policy != "own" or protect):
         raise ConfigError("expected a video alone, received env, policy=random or a filter with it; nothing can be done in a film")
@@ -158,7 +161,7 @@ def _size(agent: Agent) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
-def _of_system(agent: Agent, env: str | None, seed: int) -> tuple[Source, float]:
+def _of_system(agent: Agent, env: str | None, noise: float, seed: int) -> tuple[Source, float]:
     """Pictures of a system, and its steps per second."""
     factory = described_system(agent.description) if env in (None, PHYSICS) else EnvFactory(compose([f"env={env}"]).env)
     if factory is None:
@@ -175,17 +178,18 @@ def _of_system(agent: Agent, env: str | None, seed: int) -> tuple[Source, float]
     known = hasattr(made, "dynamics")
     begin = starts(agent, made, _STARTS, torch.Generator().manual_seed(seed)) if known else None
     pace = 1.0 / float(getattr(made, "dt", 0.05))
+    camera = CameraFault("dark", 1.0, noise=noise, seed=seed)
     if env != PHYSICS:
-        return _episodes(made, begin, seed), pace
+        return _episodes(made, begin, camera), pace
     make = made.physics() if known else None
     if make is None:
         raise ConfigError(f"expected a system with a full physics, received {type(made).__name__}, which has none; leave --env physics out")
-    return _walks(make(), begin), pace
+    return _walks(make(), begin, camera), pace
 
 
-def _episodes(env: Any, begin: Tensor | None, seed: int) -> Source:
-    """Episodes of a TorchRL environment, from given states or its own resets, with the noise of a camera."""
-    camera, k = CameraFault("dark", 1.0, noise=_NOISE, seed=seed), 0
+def _episodes(env: Any, begin: Tensor | None, camera: CameraFault) -> Source:
+    """Episodes of a TorchRL environment, from given states or its own resets, through a camera."""
+    k = 0
     while True:
         if begin is None:
             data = env.reset()
@@ -199,10 +203,10 @@ def _episodes(env: Any, begin: Tensor | None, seed: int) -> Source:
                 break
 
 
-def _walks(world: Any, begin: Tensor | None) -> Source:
-    """Episodes in full physics, with the noise of a camera."""
+def _walks(world: Any, begin: Tensor | None, camera: CameraFault) -> Source:
+    """Episodes in full physics, through a camera."""
     assert begin is not None
-    camera, k = CameraFault("dark", 1.0, noise=_NOISE), 0
+    k = 0
     try:
         while True:
             pixels, info = world.reset(options={"pose": begin[k % len(begin)].tolist()})
