@@ -188,7 +188,9 @@ def test_the_command_says_where_to_look_and_what_is_wrong(capsys):
 @pytest.mark.pybullet
 def test_the_quadruped_is_watched_in_full_physics():
     pytest.importorskip("pybullet")
-    _, events, counts = seen("quadruped", env="physics", steps=3, protect=True, noise=0.0)
+    _, events, counts = seen("quadruped", env="physics", steps=3, protect=True)
     assert counts["steps"] == 3
-    assert {e["verdict"] for e in events} == {"INSIDE"}
-    assert all("nothing is proved" in e["why"] for e in events)
+    # Nothing is proved of this agent, and the camera's noise leads its barrier out of the set at times.
+    assert {e["verdict"] for e in events} <= {"INSIDE", "OUTSIDE"}
+    assert all(("nothing is proved" in e["why"]) == (e["verdict"] == "INSIDE") for e in events)
+    assert not any(e["unsafe"] for e in events)
