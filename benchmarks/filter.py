@@ -1,64 +1,162 @@
-"""The safety filter on the pendulum: episodes that enter U under random and adversarial actions, with it and without.
+"""The safety filter: episodes that enter U under random, adversarial and safe actions, with it and without.
 
-Run: python benchmarks/filter.py [AGENT] [EPISODES] [LEVEL ...]
-Prints a table in Markdown. Episodes have 200 steps and start in {B <= 0}, drawn with a seed of their own.
+Run: python benchmarks/filter.py [AGENT] [EPISODES] [LEVEL ...] [--margin M] [--noise N] [--only ACTIONS] [--physics]
+Prints a table in Markdown. Episodes have 200 steps and start in {B <= 0}, drawn with a seed of their own; with --physics they are walks
+of the quadruped in PyBullet. An agent without a proof gets the margin --margin, .02 by default.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 import torchrl_sspl as sspl
-from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.modules.controller import Memory
-from torchrl_sspl.runtime import Shield
+from torchrl_sspl.evaluation import simulate
+from torchrl_sspl.evaluation.blocks import described_system
+from torchrl_sspl.evaluation.controllers import AgentController, Decision
+from torchrl_sspl.evaluation.simulation import Episodes
+from torchrl_sspl.runtime import Protected, SafetyWrapper, Shield
 from torchrl_sspl.runtime.monitor import starts
+from torchrl_sspl.sets import UNSAFE
 
 STEPS, SEED = 200, 20261122
+TURNS, LOOKAHEAD = 32, 60  # longest turn that the adversarial driver of a car thinks of, and how far it looks ahead, in steps
 
 
-def random_actions(state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor:
+class Driver:
+    """Actions from true states, as what acts in ``simulate``: on known dynamics from its camera's states, else from poses."""
+
+    streams = True
+
+    def __init__(self, wants: Callable[[Any, Tensor, Tensor, torch.Generator], Tensor], env: Any, reads: str = "pixels") -> None:
+        self.wants, self.env, self.reads, self.generator = wants, env, reads, torch.Generator().manual_seed(SEED + 1)
+
+    def reset(self, rows: Tensor | None = None) -> None:
+        """Nothing is held any more."""
+        self.held: Tensor | None = None
+
+    def step(self, observation: Any, rows: Tensor | None = None) -> Decision:
+        """Actions for some or all of the systems."""
+        state = (observation if self.reads == "state" else observation.state).float()
+        if self.held is None:
+            self.held = torch.zeros(len(state), self.env.action_dim)
+        index = torch.arange(len(self.held)) if rows is None else rows
+        action = self.wants(self.env, state, self.held[index], self.generator)
+        self.held[index] = action
+        return Decision(action=action)
+
+
+def random_actions(env: Any, state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor:
     """Uniform, each held for five steps on average."""
-    new = (torch.rand(len(state), 1, generator=generator) * 2 - 1) * 10
+    new = (torch.rand(len(state), 1, generator=generator) * 2 - 1) * env.max_action
     return torch.where(torch.rand(len(state), 1, generator=generator) < 0.2, new, held)
 
 
-def towards_u(state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor:
-    """Full torque away from upright."""
-    return 10.0 * torch.sign(state[:, :1] + 0.3 * state[:, 1:])
+def away_from_upright(env: Any, state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor:
+    """Full torque."""
+    return env.max_action * torch.sign(state[:, :1] + 0.3 * state[:, 1:])
 
 
-@torch.no_grad()
-def main(name: str = "pendulum", episodes: int = 1000, *levels: float) -> None:
+def towards_obstacle(env: Any, state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor:
+    """The way into U that is there first, of full turns to either side and then straight ahead; the shorter turn to its middle if none is."""
+    turns = torch.arange(-TURNS, TURNS + 1, 2)
+    x, k = state.repeat_interleave(len(turns), 0), turns.repeat(len(state))[:, None]
+    when, out = torch.full((len(x),), LOOKAHEAD), torch.zeros(len(x), dtype=torch.bool)
+    for t in range(LOOKAHEAD):
+        x = env.wrap(env.dynamics(x, env.max_action * k.sgn() * (t < k.abs())))
+        out |= ~env.state_space.contains(x)
+        when = torch.where(~out & (env.region(x)[:, 0] == UNSAFE), when.clamp(max=t), when)
+    when = when.reshape(len(state), -1)
+    chosen = turns[when.argmin(1)].sgn()[:, None] * env.max_action
+    ahead = torch.stack([state[:, 2].cos(), state[:, 2].sin()], 1)
+    aside = ahead[:, :1] * -state[:, 1:2] - ahead[:, 1:] * -state[:, :1]
+    return torch.where(when.amin(1, keepdim=True) < LOOKAHEAD, chosen, env.max_action * aside.sgn())
+
+
+ADVERSARIAL = {"pendulum": away_from_upright, "quadruped": towards_obstacle}
+
+
+def noisy(draw: Any, noise: float) -> Any:
+    """What draws states, seen by a camera with a noise of some grey levels."""
+    generator = torch.Generator().manual_seed(SEED + 2)
+
+    def drawn(state: Tensor) -> Tensor:
+        frame = draw(state).float()
+        return (frame + noise * torch.randn(frame.shape, generator=generator)).round().clamp(0, 255).to(torch.uint8)
+
+    return drawn if noise > 0.0 else draw
+
+
+def on_known_dynamics(agent: Any, env: Any, draw: Any, start: Tensor, wants: Any, shield: Shield | None) -> tuple[Episodes, str]:
+    """Episodes side by side, and the share of steps with an intervention with the mean deviation."""
+    made: list[Protected] = []
+
+    def change(latent: Tensor, action: Tensor) -> Tensor:
+        assert shield is not None
+        made.append(shield(latent, action))
+        return made[-1].action
+
+    acts = AgentController(agent, None if wants is None else Driver(wants, env), None if shield is None else change)
+    run = simulate(acts, env, start=start, horizon=STEPS, draw=draw, label="episodes" if sys.stderr.isatty() else None)
+    if not made:
+        return run, "- | -"
+    there = run.alive[1 : len(made) + 1]  # whoever left is asked for nothing
+    changed, moved = (torch.stack([getattr(m, k) for m in made])[: len(there)][there].float().mean() for k in ("intervened", "deviation"))
+    return run, f"{100 * float(changed):.3g} % | {float(moved):.2g}"
+
+
+def in_physics(agent: Any, env: Any, start: Tensor, wants: Any, options: dict[str, Any] | None) -> tuple[Episodes, str]:
+    """Walks one after the other, as above."""
+    world = env.physics()()
+    world = world if options is None else SafetyWrapper(world, agent, **options)
+    acts = agent if wants is None else Driver(wants, env, reads="state")
+    run = simulate(acts, world, start=start, horizon=STEPS, seed=SEED, label="walks" if sys.stderr.isatty() else None)
+    told = world.statistics if isinstance(world, SafetyWrapper) else None
+    world.close()
+    if told is None:
+        return run, "- | -"
+    return run, f"{100 * told['interventions'] / told['steps']:.3g} % | {told['deviation'] / told['steps']:.2g}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
-    agent, env = sspl.load(name), PendulumEnv(batch_size=[1], seed=SEED)
-    start = starts(agent, env, episodes, torch.Generator().manual_seed(SEED))
-    print("| Actions | filter | episodes that enter U | steps with an intervention | mean deviation [half ranges] |\n|---|---|---|---|---|")
-    policies = {"random": random_actions, "adversarial": towards_u, "the agent's own": None}
-    for (label, wants), level in ((p, v) for p in policies.items() for v in levels or (None, 0.0, -0.1)):
-        shield = None if level is None else Shield(agent, level=level)
-        g, memory, x, before = torch.Generator().manual_seed(SEED + 1), Memory(agent), start, env.previous_state(start)
-        entered, action = torch.zeros(len(x), dtype=torch.bool), torch.zeros(len(x), 1)
-        changed = moved = 0.0
-        for _ in tqdm(range(STEPS), desc=f"{label}, {level}", leave=False):
-            latent = memory.correct(agent.encode(torch.cat([env.draw(before), env.draw(x)], 1)))[0]
-            action = agent.policy(latent) if wants is None else wants(x, action, g)
-            taken = action
-            if shield is not None:
-                made = shield(latent, action)
-                taken = made.action
-                changed, moved = changed + float(made.intervened.float().mean()), moved + float(made.deviation.mean())
-            memory.expect(agent.dynamics(latent, taken))
-            before, x = x, env.wrap(env.dynamics(x, taken))
-            entered |= env.unsafe_set.contains(x)
-        told = "none" if level is None else f"level {level:g}"
-        print(f"| {label} | {told} | {int(entered.sum()):,} of {len(x):,} | {100 * changed / STEPS:.1f} % | {moved / STEPS:.2f} |")
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("agent", nargs="?", default="pendulum")
+    parser.add_argument("episodes", nargs="?", type=int, default=1000)
+    parser.add_argument("levels", nargs="*", type=float, default=[])
+    parser.add_argument("--margin", type=float, help="in place of the proved one")
+    parser.add_argument("--noise", type=float, default=0.0, help="of the camera, grey levels; not in physics")
+    parser.add_argument("--only", help="random, adversarial or own")
+    parser.add_argument("--physics", action="store_true", help="walks in full physics")
+    given = parser.parse_args(arguments)
+    agent = sspl.load(given.agent)
+    factory = described_system(agent.description)
+    assert factory is not None
+    env: Any = factory([1], SEED)
+    env = env.known_twin() if given.physics else env
+    start = starts(agent, env, given.episodes, torch.Generator().manual_seed(SEED))
+    margin = given.margin if given.margin is not None or agent.tolerated_error > 0 else 0.02
+    print("| Actions | filter | episodes that enter U | hit | fallen | steps with an intervention | mean deviation [half ranges] |")
+    print("|---|---|---|---|---|---|---|")
+    policies = {"random": random_actions, "adversarial": ADVERSARIAL[given.agent], "own": None}
+    for label, wants in policies.items():
+        for level in (None, *(given.levels or (0.0, -0.1))) if given.only in (None, label) else ():
+            options = None if level is None else {"level": level, "margin": margin}
+            if given.physics:
+                run, told = in_physics(agent, env, start, wants, options)
+            else:
+                shield = None if options is None else Shield(agent, **options)
+                run, told = on_known_dynamics(agent, env, noisy(env.draw, given.noise), start, wants, shield)
+            entered = int(((run.region == UNSAFE) & run.alive).any(0).sum())
+            hit, fallen = (int(run.events[k].sum()) if k in run.events else "-" for k in ("hit", "fallen"))
+            name = "none" if options is None else f"level {level:g}" + ("" if margin is None else f", margin {margin:g}")
+            print(f"| {label} | {name} | {entered:,} of {len(run):,} | {hit} | {fallen} | {told} |", flush=True)
 
 
 if __name__ == "__main__":
-    given = sys.argv[1:]
-    main(*given[:1], *(int(v) for v in given[1:2]), *(float(v) for v in given[2:]))
+    main()

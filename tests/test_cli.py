@@ -35,10 +35,10 @@ def test_usage_version_and_unknown_commands(capsys):
     assert torchrl_sspl.__version__ in capsys.readouterr().out
     assert cli.main(["--help"]) == 0
     shown = capsys.readouterr().out
-    assert all(word in shown for word in ("train", "evaluate", "verify", "compare"))
+    assert all(word in shown for word in ("train", "evaluate", "verify", "compare", "watch", "calibrate", "export"))
     assert cli.main([]) == 2
     assert cli.main(["trian"]) == 2
-    assert "one of train, evaluate, verify, compare, received 'trian'" in capsys.readouterr().err
+    assert "one of train, evaluate, verify, compare, watch, calibrate, export, received 'trian'" in capsys.readouterr().err
 
 
 def test_python_m_is_the_same_command():
@@ -290,3 +290,33 @@ def test_gymnasium_and_an_encoder_by_import_paths(tmp_path, capsys, monkeypatch)
     assert cli.main(["train", *env[:-1], "env.unsafe=my_cart:unsfe", *TINY, "out_dir=other"]) == 2
     assert "received 'my_cart:unsfe'" in capsys.readouterr().err
     assert not (tmp_path / "other").exists()
+
+
+def test_calibrate_writes_limits_that_the_monitor_reads(tmp_path, capsys):
+    agent = torchrl_sspl.load("pendulum")
+    agent.save(tmp_path / "run")
+    assert cli.main(["calibrate", str(tmp_path / "run"), "--episodes", "4", "--horizon", "3", "--pictures", "200"]) == 0
+    shown = capsys.readouterr().out
+    assert "innovation" in shown
+    assert "100 % expected" in shown  # of four episodes
+    assert torchrl_sspl.Monitor.load(tmp_path / "run").calibration.episodes == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["calibrate", "pendulum"], "--out DIRECTORY"),
+        (["calibrate", "pendulum", "--out", "x", "--episodes", "0"], "episodes, horizon"),
+        (["calibrate", "nobody"], "nobody"),
+        (["export", "pendulum", "agent.bin"], ".onnx or .pt2"),
+    ],
+)
+def test_what_cannot_be_calibrated_or_exported_is_refused(words, told, capsys):
+    assert cli.main(words) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_export_writes_the_file(tmp_path, capsys):
+    assert cli.main(["export", "pendulum", str(tmp_path / "agent.pt2")]) == 0
+    assert capsys.readouterr().out.strip().endswith("agent.pt2")
+    assert (tmp_path / "agent.pt2").stat().st_size > 1000

@@ -48,6 +48,7 @@ _NAMES = {
     "certify": "evaluation.certify",
     "Certificate": "certification.certificate",
     "SafetyFilter": "runtime",
+    "SafetyVectorWrapper": "runtime",
     "SafetyWrapper": "runtime",
     "Monitor": "runtime",
     "calibrate": "runtime",

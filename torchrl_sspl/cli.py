@@ -1,4 +1,4 @@
-"""The command ``sspl``: train, evaluate, verify, compare."""
+"""The command ``sspl``: train, evaluate, verify, compare, watch, calibrate, export."""
 
 from __future__ import annotations
 
@@ -19,7 +19,10 @@ _USAGE = """sspl COMMAND ...
   train     train an agent, evaluate it and write its report; `sspl train --help` lists every field
   evaluate  measure an agent again, on fresh data
   verify    check the certificates of an agent again
-  compare   a page with several runs beside each other"""
+  compare   a page with several runs beside each other
+  watch     see an agent at work: picture, barrier, verdict, interventions
+  calibrate limits of the monitor's signals, from clean episodes of an agent's system
+  export    one step of an agent as .onnx or .pt2"""
 _TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
 
 Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Started again with
@@ -58,7 +61,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         0
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    commands = {"train": _train, "evaluate": _evaluate, "verify": _verify, "compare": _compare}
+    commands = {
+        "train": _train, "evaluate": _evaluate, "verify": _verify, "compare": _compare, "watch": _watch, "calibrate": _calibrate,
+        "export": _export,
+    }  # fmt: skip
     if words[:1] == ["--version"]:
         from torchrl_sspl import __version__
 
@@ -240,4 +246,81 @@ def _compare(words: list[str]) -> int:
     path = page.compare(runs, options.out or Path(beside) / "comparison.html")
     print(page.text_table(page.rows_of(runs)))
     print(f"comparison: {path}")
+    return 0
+
+
+def _watch(words: list[str]) -> int:
+    """Show an agent at work on a page that is served from this machine."""
+    parser = argparse.ArgumentParser(prog="sspl watch", description="See an agent at work, on a page served from this machine.")
+    parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory with a calibration")
+    parser.add_argument("--env", help="a system as in `sspl train env=...`, or physics: its own one in full physics; default: its own one")
+    parser.add_argument("--video", metavar="FILE", help="a film in place of a system")
+    parser.add_argument("--policy", choices=("own", "random"), default="own", help="what acts (default: own)")
+    parser.add_argument("--filter", action="store_true", help="put the safety filter behind it")
+    parser.add_argument("--record", metavar="FILE.mp4", help="write a film of it")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the page; another one than 127.0.0.1 shows it to others")
+    parser.add_argument("--port", type=int, default=8000, help="its port, 0: any that is free (default: 8000)")
+    parser.add_argument("--steps", type=int, help="end after so many; default: with Ctrl-C")
+    parser.add_argument("--fps", type=float, help="steps per second; default: those of the system or the film")
+    parser.add_argument("--noise", type=float, default=1.0, help="of a system's camera, grey levels (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    given = parser.parse_args(words)
+    from torchrl_sspl.viz.live import watch
+
+    counts = watch(
+        given.agent, env=given.env, video=given.video, policy=given.policy, protect=given.filter, record=given.record,
+        host=given.host, port=given.port, steps=given.steps, fps=given.fps, noise=given.noise, seed=given.seed,
+        ready=lambda address: print(f"{address}  (Ctrl-C ends it)", flush=True),
+    )  # fmt: skip
+    print("  ".join(f"{name} {value}" for name, value in counts.items()))
+    return 0
+
+
+def _calibrate(words: list[str]) -> int:
+    """Write the limits of the monitor's signals beside an agent."""
+    parser = argparse.ArgumentParser(prog="sspl calibrate", description="Limits of the monitor's signals, from clean episodes.")
+    parser.add_argument("agent", help="run directory, or name of a shipped agent")
+    parser.add_argument("--out", metavar="DIRECTORY", help="where to write; default: the run directory")
+    parser.add_argument("--episodes", type=int, default=1000, help="for the limits; false alarms are as rare as they are many (default: 1000)")
+    parser.add_argument("--horizon", type=int, default=200, help="steps of each (default: 200)")
+    parser.add_argument("--pictures", type=int, default=20_000, help="for the model of clean pictures (default: 20000)")
+    parser.add_argument("--noise", type=float, default=1.0, help="of the camera, grey levels (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    given = parser.parse_args(words)
+    from torchrl_sspl.evaluation.blocks import described_system
+    from torchrl_sspl.modules.agent import Agent, agent_directory
+    from torchrl_sspl.runtime import calibrate
+
+    if min(given.episodes, given.horizon, given.pictures) < 1 or not given.noise >= 0.0:
+        raise ConfigError(
+            f"expected episodes, horizon and pictures >= 1 and noise >= 0, received {given.episodes}, {given.horizon}, {given.pictures} "
+            f"and {given.noise}"
+        )
+    directory = agent_directory(given.agent)
+    if given.out is None and directory.resolve().is_relative_to(Path(__file__).resolve().parent):
+        raise ConfigError(f"expected --out DIRECTORY with a shipped agent, received none; '{given.agent}' has a calibration of its own")
+    agent = Agent.load(directory)
+    factory = described_system(agent.description)
+    env = None if factory is None else factory(batch_size=[1], seed=given.seed)
+    if not hasattr(env, "previous_state"):
+        raise ConfigError("expected an agent whose system's states are known, received another one; call calibrate(agent, env) on yours")
+    found = calibrate(
+        agent, env, episodes=given.episodes, horizon=given.horizon, pictures=given.pictures, noise=given.noise, seed=given.seed,
+        progress=sys.stderr.isatty(),
+    )  # fmt: skip
+    for name, (low, high) in found.limits.items():
+        print(f"{name:<12} {low:.4g} to {high:.4g}")
+    print(f"clean episodes with an alarm: at most {100 * found.false_alarms:.3g} % expected\n{found.save(given.out or directory)}")
+    return 0
+
+
+def _export(words: list[str]) -> int:
+    """Write one step of an agent for a machine without this library."""
+    parser = argparse.ArgumentParser(prog="sspl export", description="One step of an agent, for a machine without this library.")
+    parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
+    parser.add_argument("file", help="what to write: FILE.onnx or FILE.pt2")
+    given = parser.parse_args(words)
+    from torchrl_sspl.modules.agent import load
+
+    print(load(given.agent).export(given.file))
     return 0

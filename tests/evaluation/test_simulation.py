@@ -48,6 +48,23 @@ def plain_loop(agent, env, start, horizon):
     return [torch.stack(row) for row in rows]
 
 
+def test_what_changes_actions_sees_the_latents_of_all_and_its_own_are_taken():
+    seen = []
+
+    def less(latent, action):
+        seen.append((latent, action))
+        return action / 2
+
+    env, agent = PendulumEnv(), load("pendulum")
+    start = env.sample_states(4, torch.Generator().manual_seed(0), region=env.safe_set)
+    run = simulate(AgentController(agent, change=less), env, start=start, horizon=3)
+    for t, (latent, action) in enumerate(seen):
+        assert torch.equal(latent, run.latent[t])
+        assert torch.equal(action, agent.policy(latent))
+        assert torch.equal(run.actions[t], action / 2)
+    assert len(seen) == 3
+
+
 @pytest.mark.parametrize(("name", "env"), [("pendulum", PendulumEnv(seed=0)), ("quadruped", DubinsEnv(seed=0))], ids=lambda x: str(x)[:9])
 def test_rollouts_are_those_of_a_plain_loop_bit_for_bit(name, env):
     agent, start = load(name), env.sample_states(40, torch.Generator().manual_seed(1))

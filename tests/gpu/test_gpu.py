@@ -37,6 +37,7 @@ from torchrl_sspl.lipschitz import (
 from torchrl_sspl.modules import FrameEncoder, InverseDynamics, LatentDynamics, Policy, SaLaD, make_rollout_policy
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.objectives import SSPLLoss
+from torchrl_sspl.runtime import Calibration, Monitor, Shield, calibrate
 
 pytestmark = [
     pytest.mark.gpu,
@@ -310,3 +311,21 @@ def test_figures_of_an_agent_on_the_gpu(pair):
     env, agent = PendulumEnv(batch_size=[1]), pair[1]
     latent = agent.encode(env.observe(env.sample_states(50)).cuda())
     assert viz.latent_space(latent, torch.arange(50, device="cuda") % 3, agent.barrier) is not None
+
+
+def test_the_monitor_and_the_filter_run_where_the_agent_is():
+    here, there = load("pendulum"), load("pendulum", "cuda")
+    env = PendulumEnv(batch_size=[1], seed=0)
+    state = torch.tensor([[0.05, 0.0], [0.3, 0.1]])
+    pixels = torch.cat([env.draw(state), env.draw(state)], 1)
+    monitors = [Monitor(agent, Calibration.load("pendulum", agent), batch_size=2, period=0.1) for agent in (here, there)]
+    for t, shown in enumerate((pixels, None, pixels)):
+        ours, theirs = (monitor.step(shown, time=0.1 * t) for monitor in monitors)
+        assert theirs.action.is_cuda
+        assert ours.reasons == theirs.reasons
+        assert torch.equal(ours.verdict, theirs.verdict.cpu())
+        assert torch.allclose(ours.action, theirs.action.cpu(), atol=1e-3)
+    made = Shield(there)(theirs.latent, torch.full((2, 1), 10.0, device="cuda"))
+    monitors[1].took(made.action)
+    monitors[1].reset(torch.tensor([1]))
+    assert calibrate(there, env, episodes=2, horizon=2, pictures=100).weights == monitors[1].calibration.weights

@@ -19,7 +19,7 @@ from torchrl_sspl.evaluation.controllers import AgentController
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
 from torchrl_sspl.modules.agent import Agent, load, mlp_barrier
-from torchrl_sspl.modules.controller import Memory, meets_premise
+from torchrl_sspl.modules.controller import Memory, meets_premise, premise_met
 from torchrl_sspl.modules.observer import corrected, filtered, gain_matrix, held
 
 
@@ -237,6 +237,42 @@ def test_wrong_batches_are_refused():
         small_agent().controller(0)
     with pytest.raises(ShapeError, match="4 systems"):
         small_agent().controller(4).step(frames(3))
+
+
+def test_the_memory_goes_on_from_what_was_really_done():
+    agent = small_agent()
+    controller, pushes = agent.controller(2), torch.full((2, 1), 3.0)
+    latent = controller.step(frames(2)).latent
+    controller.took(pushes)
+    seen, prior = agent.encode(frames(2, 1)), agent.dynamics(latent, pushes)
+    assert torch.allclose(controller.step(frames(2, 1)).innovation, (seen - prior).norm(dim=-1), atol=1e-6)
+    with pytest.raises(ShapeError, match=r"actions \(2, 1\)"):
+        controller.took(torch.zeros(3, 1))
+    controller.reset()
+    with pytest.raises(ConfigError, match="a step before"):
+        controller.took(pushes)
+
+
+def test_without_pixels_the_memory_goes_on_and_the_premise_is_not_met():
+    agent = small_agent(error=0.01)
+    controller = agent.controller(2)
+    assert controller.begins.all()
+    blind = controller.step(None)  # nothing was expected yet
+    assert not blind.latent.any()
+    assert controller.begins.all()
+    first = controller.step(frames(2))
+    blind = controller.step(None)
+    assert torch.equal(blind.latent, agent.dynamics(first.latent, first.action))
+    assert blind.innovation.isnan().all()
+    assert not blind.applies.any()
+    assert not controller.begins.any()
+
+
+def test_the_premise_at_another_level_and_without_held_corrections():
+    barrier, seen, error = torch.tensor([-0.3, -0.1]), torch.tensor([-0.3, -0.3]), torch.tensor([0.02, 0.005])
+    assert premise_met(barrier, seen, error, 0.01, held=True, level=-0.2).tolist() == [True, False]
+    assert premise_met(barrier, seen, error, 0.01, held=False, level=-0.2).tolist() == [False, True]
+    assert not premise_met(barrier, barrier, error, 0.0, held=True).any()
 
 
 def test_the_gain_travels_with_the_agent(tmp_path):

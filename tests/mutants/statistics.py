@@ -110,7 +110,7 @@ MUTANTS = [
     (BLOCKS, "\"aliased\": (unsafe & (torch.minimum(barrier, seen) <= level - margin)).any(0),", "\"aliased\": (unsafe & (barrier < -9)).any(0),", STEPS),
     (BLOCKS, "(~barrier.isfinite() & alive).any(0) | ~worst.isfinite()", "~worst.isfinite()[:0].any() & (barrier[0] > 1e9)", f"{LOOPS}::test_no_number_is_an_event_and_no_way_to_stay_inside"),
     (BLOCKS, "torch.stack(list(events.values())).any(0)", "events[\"left\"]", STEPS),
-    (BLOCKS, "(error <= limit * (1 + slack))", "(error <= limit * (2 + slack))", STEPS),
+    (BLOCKS, "error, limit * (1 + slack), held", "error, limit * (2 + slack), held", STEPS),
     (BLOCKS, "found, worst = counted(run, self.level, self.tolerated, held=self.held)", "found, worst = counted(run, self.level + 9, self.tolerated, held=self.held)", STEPS),
     (BLOCKS, "before, after = self._entering(n // 2, g)", "before, after = uniform[: n // 2], uniform[: n // 2]", f"{LOOPS}::test_half_of_the_observations_of_u_are_where_it_is_entered"),
     (BLOCKS, "(int((~(unsafe > self.level - m)).sum()) for m", "(0 for m", f"{LOOPS}::test_half_of_the_observations_of_u_are_where_it_is_entered"),

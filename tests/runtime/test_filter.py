@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from gymnasium.spaces import Box
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule, TensorDictSequential
 from torch import Tensor, nn
@@ -19,7 +21,7 @@ from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.modules import LatentDynamics, Policy
 from torchrl_sspl.modules.agent import Agent, load
-from torchrl_sspl.runtime import SafetyFilter, SafetyWrapper, Shield
+from torchrl_sspl.runtime import SafetyFilter, SafetyVectorWrapper, SafetyWrapper, Shield
 
 
 class Moves(LatentDynamics):
@@ -250,3 +252,75 @@ def test_environments_that_do_not_fit_are_refused(env, error, words):
 def test_a_step_before_the_first_reset_is_refused():
     with pytest.raises(ConfigError, match="reset"):
         SafetyWrapper(Gym(), load("pendulum")).step(np.zeros(1))
+
+
+class Short(Gym):
+    """Episodes of some steps."""
+
+    def __init__(self, steps: int) -> None:
+        super().__init__()
+        self.steps, self.t = steps, 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+        self.t = 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+        self.t += 1
+        observation, reward, _, _, info = super().step(action)
+        return observation, reward, False, self.t >= self.steps, info
+
+
+def vectorised(lengths: tuple[int, ...], mode: AutoresetMode) -> SafetyVectorWrapper:
+    return SafetyVectorWrapper(SyncVectorEnv([partial(Short, k) for k in lengths], autoreset_mode=mode), load("pendulum"))
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+def test_rows_of_a_vectorised_environment_are_protected_as_single_ones(mode):
+    """Row by row what the wrapper of single environments does, resets included."""
+    lengths, pushes = (7, 100), np.full((2, 1), 10.0, np.float32)
+    envs, singles = vectorised(lengths, mode), [SafetyWrapper(Short(k), load("pendulum")) for k in lengths]
+    _, info = envs.reset(seed=3)
+    told = [one.reset(seed=3 + k)[1]["safety"] for k, one in enumerate(singles)]
+    ended, steps = [False, False], 0
+    for t in range(20):
+        for k in (0, 1):
+            assert info["safety"]["barrier"][k] == pytest.approx(told[k]["barrier"], abs=1e-4), (t, k)
+        _, _, _, truncated, info = envs.step(pushes)
+        for k, one in enumerate(singles):
+            if ended[k] and mode == AutoresetMode.NEXT_STEP:
+                told[k], ended[k] = one.reset()[1]["safety"], False
+                assert not info["safety"]["intervened"][k]
+                assert info["safety"]["deviation"][k] == 0.0
+                continue
+            _, _, _, ended[k], one_info = one.step(pushes[k])
+            told[k], steps = one_info["safety"], steps + 1
+            assert bool(truncated[k]) == ended[k]
+            assert info["safety"]["taken"][k] == pytest.approx(told[k]["taken"], abs=1e-3)
+            if ended[k] and mode == AutoresetMode.SAME_STEP:
+                told[k], ended[k] = one.reset()[1]["safety"], False
+    assert envs.statistics["steps"] == steps
+    assert envs.statistics["interventions"] == sum(one.statistics["interventions"] for one in singles) > 0
+
+
+def test_rows_whose_proof_is_lost_get_it_back_with_their_next_episode():
+    envs = vectorised((3, 3), AutoresetMode.SAME_STEP)
+    envs.reset(seed=0)
+    envs._guard._controller._applies[:] = False
+    assert [envs.step(np.zeros((2, 1), np.float32))[4]["safety"]["applies"].tolist() for _ in range(3)][1:] == [[False] * 2, [True] * 2]
+    envs._guard._controller._applies[:] = False
+    assert envs.reset(seed=0)[1]["safety"]["applies"].all()
+
+
+def test_vectorised_environments_that_do_not_fit_are_refused():
+    with pytest.raises(ConfigError, match="autoreset_mode=Disabled"):
+        vectorised((3,), AutoresetMode.DISABLED)
+    with pytest.raises(ConfigError, match="SafetyVectorWrapper"):
+        SafetyWrapper(SyncVectorEnv([Gym]), load("pendulum"))
+    with pytest.raises(ConfigError, match="two RGB frames"):
+        SafetyVectorWrapper(gymnasium.make_vec("CartPole-v1", num_envs=1), load("pendulum"))
+    envs = vectorised((3,), AutoresetMode.NEXT_STEP)
+    with pytest.raises(ConfigError, match="before the first step"):
+        envs.step(np.zeros((1, 1)))
+    with pytest.raises(ConfigError, match="reset_mask"):
+        envs.reset(options={"reset_mask": np.array([True])})

@@ -113,7 +113,7 @@ def test_what_was_really_done_is_what_the_memory_goes_on_from():
     out = monitor.step(shown()[0])
     push = torch.full((1, 1), 7.0)
     monitor.took(push)
-    assert torch.equal(monitor._memory.prior, other.dynamics(out.latent, push))
+    assert torch.equal(monitor._controller._memory.prior, other.dynamics(out.latent, push))
     with pytest.raises(ShapeError, match="expected actions"):
         monitor.took(torch.zeros(2, 1))
 
@@ -134,7 +134,7 @@ def test_a_fallback_acts_on_the_rows_with_an_alarm_and_the_memory_knows_it():
     out = monitor.step(pictures)
     assert float(out.action[1]) == 3.0
     assert float(out.action[0]) == pytest.approx(float(monitor.agent.policy(out.latent)[0]))
-    assert torch.equal(monitor._memory.prior, monitor.agent.dynamics(out.latent, out.action))
+    assert torch.equal(monitor._controller._memory.prior, monitor.agent.dynamics(out.latent, out.action))
 
 
 @pytest.mark.parametrize(
@@ -155,7 +155,7 @@ def test_what_is_no_picture_is_an_alarm_and_the_memory_goes_on(pixels, reason):
     assert names(out.verdict) == ["UNKNOWN_PICTURE"]
     assert bool(out.action.isfinite().all())
     expected = monitor.agent.dynamics(out.latent, out.action)
-    assert torch.equal(monitor._memory.prior, expected)
+    assert torch.equal(monitor._controller._memory.prior, expected)
     assert bool(monitor.step(second).action.isfinite().all())
     assert Monitor.load("pendulum").step(pixels).reasons == [[reason]]  # as the first thing that is seen
 

@@ -22,6 +22,7 @@ from torchrl_sspl.evaluation.measurements import MakeEnv
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.functional import covering_radius
 from torchrl_sspl.modules.agent import Agent, hosted
+from torchrl_sspl.modules.controller import premise_met
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE
 
@@ -140,11 +141,10 @@ def counted(
     }
     events["events"] = torch.stack(list(events.values())).any(0)
     limit = 0.0 if tolerated is None else tolerated
-    met = (barrier[1:] <= level + margin) if held else (error <= limit * (1 + slack))
-    met = met & (seen[1:] <= level + margin) & torch.tensor(limit > 0.0)
+    met = premise_met(barrier[1:], seen[1:], error, limit * (1 + slack), held=held, level=level + margin)
     missing = ~met & alive[1:]
     # An episode without a step has nothing to show but its first observation.
-    exceeding = missing.any(0) | ~((seen[0] <= level + margin) & torch.tensor(limit > 0.0))
+    exceeding = missing.any(0) | ~premise_met(seen[0], seen[0], torch.zeros_like(seen[0]), limit, held=held, level=level + margin)
     sums = events | {"exceeding": exceeding, "uncovered": missing}
     return {k: int(v.sum()) for k, v in sums.items()}, worst
 

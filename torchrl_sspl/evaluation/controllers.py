@@ -115,6 +115,7 @@ class AgentController:
         agent: frozen agent; its encoder stays on its device.
         driver: a controller on pixels that acts in place of the agent's policy, while the agent watches: its barrier
             values and predictions are those of the actions taken.
+        change: (latents ``(n, p)``, wanted actions ``(n, m)``) -> actions taken ``(n, m)``, such as a safety filter.
 
     Example:
         >>> from torchrl_sspl.modules.agent import load
@@ -125,9 +126,9 @@ class AgentController:
 
     reads = "pixels"
 
-    def __init__(self, agent: Agent, driver: Any = None) -> None:
+    def __init__(self, agent: Agent, driver: Any = None, change: Callable[[Tensor, Tensor], Tensor] | None = None) -> None:
         self._device = next(agent.barrier.parameters()).device
-        self.agent = hosted(agent)
+        self.agent, self.change = hosted(agent), change
         self.driver = None if driver is None else as_controller(driver)
         #: Whether ``step`` takes a camera, too.
         self.streams = self.driver is None or getattr(self.driver, "streams", False)
@@ -161,6 +162,7 @@ class AgentController:
             chosen = self.driver.step(observation, rows).action  # type: ignore[arg-type]
             action = chosen if rows is None or self._action is None else self._action.index_copy(0, rows, chosen)
             self._action = action
+        action = action if self.change is None else self.change(decision.latent, action)
         predicted = agent.dynamics(decision.latent, action)
         self._memory.expect(predicted, rows)
         expected = {"predicted": predicted, "predicted_barrier": agent.barrier(predicted)[:, 0]}

@@ -2,6 +2,7 @@ r"""What runs on the robot: an agent with its memory, and the premise of its pro
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -49,6 +50,13 @@ class Memory:
         latent, cut = held(agent.barrier, expected, latent, agent.held_error)
         return latent, innovation, cut
 
+    def unseen(self, n: int) -> Tensor:
+        """Latents ``(n, p)`` where nothing is seen: what was expected; zeros where nothing was. Nothing is remembered."""
+        if self.prior is None:
+            self.prior = torch.zeros(n, self.agent.latent_dim, device=self.agent.gain.device)
+            self.begins = torch.ones(n, dtype=torch.bool, device=self.agent.gain.device)
+        return self.prior
+
     def expect(self, predicted: Tensor, rows: Tensor | None = None) -> None:
         """Predictions ``(n, p)`` for the next step, of all or of some of the episodes."""
         assert self.prior is not None
@@ -61,18 +69,36 @@ class Memory:
 
 
 def meets_premise(agent: Any, barrier: Tensor, seen: Tensor, error: Tensor) -> Tensor:
-    """Whether steps meet the premise of the proof (Theorem F in ``docs/theory.md``), bool of the shape of what is given.
+    """Whether an agent's steps meet the premise of its proof, at level zero; see :func:`premise_met`. Source: none.
 
     Args:
         agent: gives the tolerated error, and whether corrections are held in the set.
+        barrier, seen, error: as there.
+    """
+    return premise_met(barrier, seen, error, agent.tolerated_error, held=agent.held_error > 0.0)
+
+
+def premise_met(barrier: Tensor, seen: Tensor, error: Tensor, tolerated: float, *, held: bool, level: float = 0.0) -> Tensor:
+    """Whether steps meet the premise of the proof (Theorem F in ``docs/theory.md``), bool of the shape of what is given.
+
+    Without held corrections the memory is proved to stay in the set, so that its barrier need not be asked.
+
+    Args:
         barrier, seen: barrier values of the memory, and of what was seen by itself.
         error: length of the corrections, latent units.
+        tolerated: error below which the set is proved to be kept, latent units; 0: nothing is proved.
+        held: whether corrections are held in the set.
+        level: of the set.
 
     Source: none.
+
+    Example:
+        >>> premise_met(torch.tensor([-0.1, 0.1]), torch.tensor([-0.1, -0.1]), torch.ones(2), 0.01, held=True)
+        tensor([ True, False])
     """
     # A comparison with a number that is none is false.
-    met = (seen <= 0.0) & (barrier <= 0.0) & torch.tensor(agent.tolerated_error > 0.0, device=seen.device)
-    return met if agent.held_error > 0.0 else met & (error <= agent.tolerated_error)
+    met = (seen <= level) & torch.tensor(tolerated > 0.0, device=seen.device)
+    return met & ((barrier <= level) if held else (error <= tolerated))
 
 
 @dataclass
@@ -86,6 +112,7 @@ class Step:
     error: Tensor  # (n,) of it, what entered the closed loop: distance of the latent from what was expected
     applies: Tensor  # (n,) bool, whether the premise of the proof has held at every step since the reset
     latent: Tensor  # (n, p)
+    seen: Tensor  # (n, p) of the observation by itself
 
 
 class Controller:
@@ -122,26 +149,59 @@ class Controller:
         self.agent, self.batch_size = agent, batch_size
         self._memory = Memory(agent)
         self._applies = torch.ones(batch_size, dtype=torch.bool, device=agent.gain.device)
+        self._last: tuple[Tensor, torch.Size] | None = None  # latent, and the shape of the action that was told
+
+    @property
+    def begins(self) -> Tensor:
+        """``(n,)`` bool, of which systems nothing was seen yet."""
+        begins = self._memory.begins
+        return torch.ones_like(self._applies) if begins is None else begins.clone()
 
     def reset(self, rows: Tensor | None = None) -> None:
         """Begin new episodes: all n, or those of some rows (indices or a mask)."""
         index = None if rows is None else torch.arange(self.batch_size, device=self._applies.device)[rows]
         self._memory.forget(index)
         self._applies[slice(None) if index is None else index] = True
+        if rows is None:
+            self._last = None
 
     @torch.no_grad()
-    def step(self, pixels: Tensor) -> Step:
-        """Actions for pixels ``(n, 6, H, W)`` uint8, frames t-1 and t; a ShapeError for another number of them."""
-        if len(pixels) != self.batch_size:
-            raise ShapeError(f"expected pixels of {self.batch_size} systems, received {len(pixels)}; make a controller for them")
-        agent, memory = self.agent, self._memory
-        seen = agent.encode(pixels.to(agent.gain.device))
-        latent, innovation, _ = memory.correct(seen)
+    def step(self, pixels: Tensor | None) -> Step:
+        """Actions for pixels ``(n, 6, H, W)`` uint8, frames t-1 and t; a ShapeError for another number of them.
+
+        Without pixels (``None``) the memory goes on with what it expects, and the premise is not met; what would have been seen,
+        and its distances, are NaN.
+        """
+        agent, memory, n = self.agent, self._memory, self.batch_size
+        if pixels is None:
+            latent, rows = memory.unseen(n), (~self.begins).nonzero()[:, 0]
+            seen = innovation = torch.full_like(latent, math.nan)
+        elif len(pixels) != n:
+            raise ShapeError(f"expected pixels of {n} systems, received {len(pixels)}; make a controller for them")
+        else:
+            seen, rows = agent.encode(pixels.to(agent.gain.device)), None
+            latent, innovation, _ = memory.correct(seen)
         action, barrier = agent.policy(latent), agent.barrier(latent)[:, 0]
         error = (latent - (seen - innovation)).norm(dim=-1)
         self._applies = self._applies & meets_premise(agent, barrier, agent.barrier(seen)[:, 0], error)
-        memory.expect(agent.dynamics(latent, action))
-        return Step(action, barrier, barrier <= 0.0, innovation.norm(dim=-1), error, self._applies.clone(), latent)
+        memory.expect(agent.dynamics(latent, action), rows)
+        self._last = latent, action.shape
+        return Step(action, barrier, barrier <= 0.0, innovation.norm(dim=-1), error, self._applies.clone(), latent, seen)
+
+    @torch.no_grad()
+    def took(self, action: Tensor) -> None:
+        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told.
+
+        Raises:
+            ConfigError: before the first step since a reset.
+            ShapeError: for actions of another shape.
+        """
+        if self._last is None:
+            raise ConfigError("expected a step before took(), received none since the reset")
+        latent, shape = self._last
+        if action.shape != shape:
+            raise ShapeError(f"expected actions {tuple(shape)}, received {tuple(action.shape)}")
+        self._memory.expect(self.agent.dynamics(latent, action), (~self.begins).nonzero()[:, 0])
 
 
-__all__ = ["Controller", "Memory", "Step", "meets_premise"]
+__all__ = ["Controller", "Memory", "Step", "meets_premise", "premise_met"]

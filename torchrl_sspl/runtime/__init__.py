@@ -3,9 +3,9 @@
 from torchrl_sspl.runtime.faults import CameraFault
 from torchrl_sspl.runtime.filter import Protected, SafetyFilter, Shield
 from torchrl_sspl.runtime.monitor import Calibration, Monitor, Verdict, Watched, calibrate
-from torchrl_sspl.runtime.wrapper import SafetyWrapper
+from torchrl_sspl.runtime.wrapper import SafetyVectorWrapper, SafetyWrapper
 
 __all__ = [
-    "Calibration", "CameraFault", "Monitor", "Protected", "SafetyFilter", "SafetyWrapper", "Shield", "Verdict", "Watched",
-    "calibrate",
+    "Calibration", "CameraFault", "Monitor", "Protected", "SafetyFilter", "SafetyVectorWrapper", "SafetyWrapper", "Shield",
+    "Verdict", "Watched", "calibrate",
 ]  # fmt: skip

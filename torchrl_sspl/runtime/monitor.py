@@ -2,6 +2,7 @@ r"""The monitor: what an agent knows at every step, and an alarm where its pictu
 
 from __future__ import annotations
 
+import copy
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +23,7 @@ from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import Decision
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.modules.agent import Agent, agent_directory
-from torchrl_sspl.modules.controller import Memory, meets_premise
+from torchrl_sspl.modules.controller import Controller, Step
 from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.runtime.faults import CameraFault
 from torchrl_sspl.seeds import spawn
@@ -190,9 +191,10 @@ class Monitor:
                 f"expected batch_size >= 1, clear_after >= 1, fallback in {FALLBACKS} or a function, and a positive period or None, "
                 f"received {batch_size}, {clear_after}, {fallback!r} and {period}"
             )
+        calibration.model.to(agent.gain.device)
         self.agent, self.calibration, self.batch_size = agent, calibration, batch_size
         self.fallback, self.period, self.clear_after, self.signals = fallback, period, clear_after, tuple(signals)
-        self._memory = Memory(agent)
+        self._controller = Controller(agent, batch_size)
         self.reset()
 
     @classmethod
@@ -203,18 +205,13 @@ class Monitor:
 
     def reset(self, rows: Tensor | None = None) -> None:
         """Begin new episodes: all n, or those of some rows (indices or a mask)."""
-        n = self.batch_size
+        n, device = self.batch_size, self.agent.gain.device
+        index = slice(None) if rows is None else torch.arange(n, device=device)[rows]
         if rows is None:
-            self._memory.forget()
-            self._applies, self._fresh = torch.ones(n, dtype=torch.bool), torch.ones(n, dtype=torch.bool)
-            self._quiet = torch.full((n,), self.clear_after)
+            self._quiet, self._still = torch.zeros(n, dtype=torch.int64, device=device), torch.zeros(n, device=device)
             self._frame: Tensor | None = None
-            self._still = torch.zeros(n)
             self._time: Tensor | None = None
-            return
-        index = torch.arange(n)[rows]
-        self._memory.forget(index)
-        self._applies[index], self._fresh[index] = True, True
+        self._controller.reset(rows)
         self._quiet[index], self._still[index] = self.clear_after, 0.0
 
     @torch.no_grad()
@@ -227,47 +224,44 @@ class Monitor:
 
         Raises ShapeError for another number of pictures.
         """
-        agent, n = self.agent, self.batch_size
-        late = self._late(time)
+        n, fresh = self.batch_size, self._controller.begins
+        late = self._late(time, fresh)
         if pixels is not None and (pixels.ndim < 1 or len(pixels) != n):
             raise ShapeError(f"expected pictures of {n} systems, received {tuple(pixels.shape)}; make a monitor for them")
-        fault = self._unreadable(pixels)
-        if fault or pixels is None:
-            return self._blind(fault, late)
-        seen = agent.encode(pixels)
-        latent, innovation, _ = self._memory.correct(seen)
-        expected = seen - innovation
-        signals = {"innovation": innovation.norm(dim=-1).masked_fill(self._fresh, math.nan)} | self._looked_at(pixels, seen)
-        barrier = agent.barrier(latent)[:, 0]
-        met = meets_premise(agent, barrier, agent.barrier(seen)[:, 0], (latent - expected).norm(dim=-1))
         reasons = [[] for _ in range(n)] if late is None else [["time"] if bool(one) else [] for one in late]
+        fault = self._unreadable(pixels)
+        step = self._controller.step(None if fault else pixels)
+        if fault or pixels is None:  # the memory goes on with what it expects, and the proof no longer applies
+            signals = {name: torch.full_like(step.barrier, math.nan) for name in SIGNALS}
+            return self._decided(step, signals, [[fault, *found] for found in reasons])
+        signals = {"innovation": step.innovation.masked_fill(fresh, math.nan)} | self._looked_at(pixels, step.seen, fresh)
         for name in self.signals:
             value, (low, high) = signals[name], self.calibration.limits[name]
             beyond = (value > high) | (value < low) | value.isinf()
             for k in beyond.nonzero()[:, 0].tolist():
                 reasons[k].append(name)
-        return self._decided(latent, barrier, met, signals, reasons)
+        return self._decided(step, signals, reasons)
 
     def took(self, action: Tensor) -> None:
-        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told."""
-        if action.shape != self._told.action.shape:
-            raise ShapeError(f"expected actions {tuple(self._told.action.shape)}, received {tuple(action.shape)}")
-        rows = (~self._fresh).nonzero()[:, 0]
-        with torch.no_grad():
-            self._memory.expect(self.agent.dynamics(self._told.latent, action), rows)
+        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told.
 
-    def _looked_at(self, pixels: Tensor, seen: Tensor) -> dict[str, Tensor]:
+        A ConfigError before the first step, a ShapeError for actions of another shape.
+        """
+        self._controller.took(action)
+
+    def _looked_at(self, pixels: Tensor, seen: Tensor, fresh: Tensor) -> dict[str, Tensor]:
         """The signals that pictures give, and what is remembered of them."""
+        pixels = pixels.to(seen.device)
         before, frame = pixels[:, :3], pixels[:, 3:].float() / 255.0
         off = (small(frame) - self.calibration.model(seen)).abs().mean(1)
         texture = (frame.diff(dim=-1).abs().mean((1, 2, 3)) + frame.diff(dim=-2).abs().mean((1, 2, 3))) / 2
-        known = torch.full((len(pixels),), math.nan) if self._frame is None else _apart(before, self._frame)
+        known = torch.full_like(texture, math.nan) if self._frame is None else _apart(before, self._frame)
         same = (pixels[:, :3] == pixels[:, 3:]).flatten(1).all(1)
-        self._still = torch.where(same & ~self._fresh, self._still + 1.0, 0.0)
+        self._still = torch.where(same & ~fresh, self._still + 1.0, 0.0)
         self._frame = pixels[:, 3:].clone()
         return {
             "picture": off.mean((1, 2)), "place": off.amax((1, 2)), "texture": texture,
-            "order": known.masked_fill(self._fresh, math.nan), "still": self._still.clone(),
+            "order": known.masked_fill(fresh, math.nan), "still": self._still.clone(),
         }  # fmt: skip
 
     def _unreadable(self, pixels: Tensor | None) -> str:
@@ -278,50 +272,32 @@ class Monitor:
         wrong = pixels.ndim != 4 or pixels.shape[1] != 6 or (size is not None and tuple(pixels.shape[2:]) != tuple(size))
         return "kind" if pixels.dtype != torch.uint8 else "size" if wrong else ""
 
-    def _late(self, time: float | Tensor | None) -> Tensor | None:
+    def _late(self, time: float | Tensor | None, fresh: Tensor) -> Tensor | None:
         """``(n,)`` bool, which pictures came too early or too late; None where nobody looks."""
         if time is None or self.period is None:
             return None
-        now = torch.as_tensor(time, dtype=torch.float64).expand(self.batch_size).clone()
+        now = torch.as_tensor(time, dtype=torch.float64, device=fresh.device).expand(self.batch_size).clone()
         before, self._time = self._time, now
         if before is None:
             return ~now.isfinite()
-        fits = ((now - before - self.period).abs() <= _LATE * self.period) | self._fresh
+        fits = ((now - before - self.period).abs() <= _LATE * self.period) | fresh
         return ~(fits & now.isfinite())
 
-    def _blind(self, fault: str, late: Tensor | None) -> Watched:
-        """A step without a picture: the memory goes on with what it expects, and the proof no longer applies."""
-        memory, n = self._memory, self.batch_size
-        if memory.prior is None or bool(self._fresh.any()):  # nothing is expected yet
-            memory.prior = torch.zeros(n, self.agent.latent_dim) if memory.prior is None else memory.prior
-            memory.begins = torch.ones(n, dtype=torch.bool) if memory.begins is None else memory.begins
-        latent = memory.prior
-        signals = {name: torch.full((n,), math.nan) for name in SIGNALS}
-        reasons = [[fault] + (["time"] if late is not None and bool(late[k]) else []) for k in range(n)]
-        return self._decided(latent, self.agent.barrier(latent)[:, 0], torch.zeros(n, dtype=torch.bool), signals, reasons, blind=True)
-
-    def _decided(
-        self, latent: Tensor, barrier: Tensor, met: Tensor, signals: dict[str, Tensor], reasons: list[list[str]], blind: bool = False
-    ) -> Watched:
+    def _decided(self, step: Step, signals: dict[str, Tensor], reasons: list[list[str]]) -> Watched:
         """The verdict, and the action that belongs to it."""
-        strange = torch.tensor([bool(r) for r in reasons])
+        strange = torch.tensor([bool(r) for r in reasons], device=step.barrier.device)
         self._quiet = torch.where(strange, 0, self._quiet + 1)
         alarm = self._quiet < self.clear_after
-        self._applies &= met
-        verdict = torch.where(self._applies, Verdict.PROOF_APPLIES, Verdict.INSIDE)
-        verdict = torch.where(barrier <= 0.0, verdict, Verdict.OUTSIDE).masked_fill(alarm, Verdict.UNKNOWN_PICTURE)
-        action = self.agent.policy(latent)
-        told = Watched(action, verdict, alarm, barrier, signals, reasons, latent)
+        verdict = torch.where(step.applies, Verdict.PROOF_APPLIES, Verdict.INSIDE)
+        verdict = torch.where(step.inside, verdict, Verdict.OUTSIDE).masked_fill(alarm, Verdict.UNKNOWN_PICTURE)
+        told = Watched(step.action, verdict, alarm, step.barrier, signals, reasons, step.latent)
         if bool(alarm.any()) and self.fallback != "policy":
+            action = step.action
             other = torch.zeros_like(action) if self.fallback == "stop" else self.fallback(told)  # type: ignore[operator]
             if not isinstance(other, Tensor) or other.shape != action.shape:
                 raise ShapeError(f"expected a fallback that returns actions {tuple(action.shape)}, received {getattr(other, 'shape', other)}")
             told.action = torch.where(alarm[:, None], other, action)
-        begun = ~self._fresh | (not blind)
-        after = self.agent.dynamics(latent, told.action)
-        self._memory.expect(after, begun.nonzero()[:, 0])
-        self._fresh = ~begun
-        self._told = told
+            self._controller.took(told.action)
         return told
 
 
@@ -438,6 +414,7 @@ def calibrate(
 
     Raises ConfigError if no start lies in the set. Source: none.
     """
+    agent = copy.deepcopy(agent).cpu()  # where the system is
     g = torch.Generator().manual_seed(spawn(seed, "monitor", 0))
     with torch.random.fork_rng():
         torch.manual_seed(spawn(seed, "monitor", 1))

@@ -8,12 +8,13 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium.spaces import Box
+from gymnasium.vector import VectorEnv, VectorWrapper
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.modules.agent import Agent
-from torchrl_sspl.modules.controller import Memory
+from torchrl_sspl.modules.controller import Controller
 from torchrl_sspl.runtime.filter import Shield
 
 
@@ -42,60 +43,134 @@ class SafetyWrapper(gymnasium.Wrapper):
     """
 
     def __init__(self, env: gymnasium.Env, agent: Agent, **options: Any) -> None:
+        if isinstance(env, VectorEnv):
+            raise ConfigError("expected a single environment, received a vectorised one; use SafetyVectorWrapper(env, agent)")
         super().__init__(env)
-        self.agent, self.shield = agent, Shield(agent, **options)
-        self._layout = _layout(env.observation_space)
-        scale, space = self.shield.scale.cpu().numpy(), env.action_space
-        if not isinstance(space, Box) or space.shape != scale.shape or not (
-            np.allclose(space.high, scale, rtol=1e-4) and np.allclose(space.low, -scale, rtol=1e-4)
-        ):  # fmt: skip
-            raise ConfigError(
-                f"expected actions between -{scale} and {scale}, those that the agent was trained with, received {space}; rescale "
-                "them (gymnasium.wrappers.RescaleAction) inside of this wrapper"
-            )
-        size = getattr(agent.encoder, "image_size", None)
-        shown = tuple(_frames(np.zeros(env.observation_space.shape or (), np.uint8), self._layout).shape[-2:])
-        if size is not None and tuple(size) != shown:
-            raise ShapeError(f"expected pictures of {tuple(size)} pixels, received {shown}; resize them inside of this wrapper")
-        self.statistics: dict[str, float] = {"steps": 0, "interventions": 0, "deviation": 0.0}
-        self._memory = Memory(agent)
-        self._latent: Tensor | None = None
-        self._applies = True
+        self._guard = _Guard(agent, env.observation_space, env.action_space, 1, options)
+        self.agent, self.shield, self.statistics = agent, self._guard.shield, self._guard.statistics
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         """Begin an episode; the memory forgets."""
         observation, info = self.env.reset(**options)
-        self._memory.forget()
-        self._applies = True
-        return observation, info | {"safety": self._look(observation)}
+        return observation, info | {"safety": self._told(self._guard.begin(np.asarray(observation)[None]))}
 
     def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
         """A step under the action, or one in place of it; a ConfigError before the first reset."""
+        made = self._guard.protect(np.asarray(action)[None])
+        observation, reward, terminated, truncated, info = self.env.step(made["taken"][0])
+        return observation, reward, terminated, truncated, info | {"safety": self._told(made | self._guard.look(np.asarray(observation)[None]))}
+
+    @staticmethod
+    def _told(rows: dict[str, NDArray[Any]]) -> dict[str, Any]:
+        """Of the one row; plain numbers where it has no size."""
+        return {name: row[0].item() if row.ndim == 1 else row[0] for name, row in rows.items()}
+
+
+class SafetyVectorWrapper(VectorWrapper):
+    r"""Does what :class:`SafetyWrapper` does around a vectorised environment of gymnasium, with a memory of its own for every row.
+
+    Entries of ``info["safety"]`` are arrays, first over the rows. Where an environment resets itself in the next step, the action of that step
+    goes nowhere and is neither changed nor counted; where it does so in the same step, ``info["safety"]`` is about the first observation of
+    the new episode. Source: none.
+
+    Args:
+        env: vectorised environment that resets its rows by itself (``AutoresetMode.NEXT_STEP`` or ``SAME_STEP``).
+        agent: frozen agent.
+        **options: of :class:`~torchrl_sspl.runtime.Shield`; errors too.
+
+    Raises:
+        ConfigError: as :class:`SafetyWrapper`, and if rows are not reset by themselves.
+        ShapeError: if the pictures are of another size than those the agent was trained on.
+
+    Example:
+        >>> from torchrl_sspl.modules.agent import load
+        >>> envs = gymnasium.make_vec("SSPL/QuadrupedObstacle-v0", num_envs=4)  # doctest: +SKIP
+        >>> envs = SafetyVectorWrapper(envs, load("quadruped"), margin=0.02)  # doctest: +SKIP
+    """
+
+    def __init__(self, env: VectorEnv, agent: Agent, **options: Any) -> None:
+        super().__init__(env)
+        mode = env.metadata.get("autoreset_mode", "NextStep")
+        self._mode = str(getattr(mode, "value", mode))
+        if self._mode not in ("NextStep", "SameStep"):
+            raise ConfigError(f"expected an environment that resets its rows by itself, received autoreset_mode={self._mode}; choose another")
+        self._guard = _Guard(agent, env.single_observation_space, env.single_action_space, env.num_envs, options)
+        self.agent, self.shield, self.statistics = agent, self._guard.shield, self._guard.statistics
+        self._ended = np.zeros(env.num_envs, dtype=bool)
+
+    def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
+        """Begin episodes in all rows; the memory forgets. A ConfigError for ``options["reset_mask"]``: rows reset themselves."""
+        if "reset_mask" in (options.get("options") or {}):
+            raise ConfigError("expected a reset of all rows, received a reset_mask; rows whose episode ends are reset by themselves")
+        observation, info = self.env.reset(**options)
+        self._ended[:] = False
+        return observation, info | {"safety": self._guard.begin(observation)}
+
+    def step(self, actions: Any) -> tuple[Any, Any, Any, Any, dict[str, Any]]:
+        """A step under the actions, or others in place of them; a ConfigError before the first reset."""
+        resting = self._ended if self._mode == "NextStep" else np.zeros_like(self._ended)
+        made = self._guard.protect(np.asarray(actions), resting)
+        observation, reward, terminated, truncated, info = self.env.step(made["taken"])
+        self._ended = np.asarray(terminated | truncated)
+        begins = resting if self._mode == "NextStep" else self._ended
+        return observation, reward, terminated, truncated, info | {"safety": made | self._guard.look(observation, begins)}
+
+
+class _Guard:
+    """What both wrappers share: the shield, the agent's memory, and what is counted."""
+
+    def __init__(self, agent: Agent, observations: gymnasium.Space, actions: gymnasium.Space, n: int, options: dict[str, Any]) -> None:
+        self.shield, self._layout = Shield(agent, **options), _layout(observations)
+        scale = self.shield.scale.cpu().numpy()
+        if not isinstance(actions, Box) or actions.shape != scale.shape or not (
+            np.allclose(actions.high, scale, rtol=1e-4) and np.allclose(actions.low, -scale, rtol=1e-4)
+        ):  # fmt: skip
+            raise ConfigError(
+                f"expected actions between -{scale} and {scale}, those that the agent was trained with, received {actions}; rescale "
+                "them (gymnasium.wrappers.RescaleAction) inside of this wrapper"
+            )
+        size = getattr(agent.encoder, "image_size", None)
+        shown = tuple(_frames(np.zeros(observations.shape or (), np.uint8), self._layout).shape[-2:])
+        if size is not None and tuple(size) != shown:
+            raise ShapeError(f"expected pictures of {tuple(size)} pixels, received {shown}; resize them inside of this wrapper")
+        self.statistics: dict[str, float] = {"steps": 0, "interventions": 0, "deviation": 0.0}
+        self._type, self._controller = actions.dtype, Controller(agent, n)
+        self._held = agent.held_error > 0.0
+        self._latent: Tensor | None = None
+
+    def begin(self, observation: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
+        """What is thought of the first observations of n episodes."""
+        self._controller.reset()
+        return self.look(observation)
+
+    def look(self, observation: NDArray[np.uint8], begins: NDArray[np.bool_] | None = None) -> dict[str, NDArray[Any]]:
+        """What is thought of n observations, of which some begin an episode."""
+        if begins is not None and begins.any():
+            self._controller.reset(torch.from_numpy(begins.nonzero()[0]))
+        step = self._controller.step(_frames(np.asarray(observation), self._layout))
+        self._latent = step.latent
+        applies = step.applies & self._held  # of a filter it is proved with held corrections alone
+        told = {"barrier": step.barrier, "inside": step.inside, "applies": applies}
+        return {name: value.cpu().numpy() for name, value in told.items()}
+
+    def protect(self, wanted: NDArray[Any], resting: NDArray[np.bool_] | None = None) -> dict[str, NDArray[Any]]:
+        """What is done in place of n actions, but of rows that only wait for their reset."""
         if self._latent is None:
             raise ConfigError("expected reset() before the first step, received step()")
-        wanted = torch.as_tensor(np.asarray(action), dtype=torch.float32, device=self._latent.device).reshape(1, -1)
-        made = self.shield(self._latent, wanted)
-        self._memory.expect(self.agent.dynamics(self._latent, made.action))
-        taken: NDArray[np.floating] = made.action[0].cpu().numpy().astype(self.env.action_space.dtype)
-        observation, reward, terminated, truncated, info = self.env.step(taken)
-        told: dict[str, Any] = {
-            "intervened": bool(made.intervened), "wanted": wanted[0].cpu().numpy(), "taken": taken,
-            "deviation": float(made.deviation), "margin": float(made.margin),
+        asked = torch.as_tensor(wanted, dtype=torch.float32, device=self._latent.device).reshape(len(self._latent), -1)
+        made = self.shield(self._latent, asked)
+        moves = torch.ones_like(made.intervened) if resting is None else ~torch.from_numpy(resting).to(made.intervened.device)
+        action = torch.where(moves[:, None], made.action, asked)
+        self._controller.took(action)
+        told = {
+            "intervened": made.intervened & moves, "wanted": asked, "taken": action, "deviation": made.deviation * moves,
+            "margin": made.margin,
         }  # fmt: skip
-        self.statistics["steps"] += 1
-        self.statistics["interventions"] += told["intervened"]
-        self.statistics["deviation"] += told["deviation"]
-        return observation, reward, terminated, truncated, info | {"safety": told | self._look(observation)}
-
-    @torch.no_grad()
-    def _look(self, observation: Any) -> dict[str, Any]:
-        """What is thought of an observation."""
-        agent = self.agent
-        seen = agent.encode(_frames(np.asarray(observation), self._layout)[None].to(agent.gain.device))
-        self._latent = self._memory.correct(seen)[0]
-        barrier = float(agent.barrier(self._latent))
-        self._applies &= agent.held_error > 0.0 and barrier <= 0.0 and float(agent.barrier(seen)) <= 0.0
-        return {"barrier": barrier, "inside": barrier <= 0.0, "applies": self._applies}
+        self.statistics["steps"] += int(moves.sum())
+        self.statistics["interventions"] += int(told["intervened"].sum())
+        self.statistics["deviation"] += float(told["deviation"].sum())
+        rows = {name: value.cpu().numpy() for name, value in told.items()}
+        return rows | {"taken": rows["taken"].astype(self._type)}
 
 
 def _layout(space: gymnasium.Space) -> str:
@@ -113,11 +188,12 @@ def _layout(space: gymnasium.Space) -> str:
 
 
 def _frames(observation: NDArray[np.uint8], layout: str) -> Tensor:
-    """``(6, H, W)`` uint8."""
+    """``(*batch, 6, H, W)`` uint8."""
     pixels = torch.from_numpy(np.ascontiguousarray(observation))
-    if layout == "channels last":
-        return pixels.permute(2, 0, 1)
-    return pixels if layout == "channels first" else pixels.permute(0, 3, 1, 2).flatten(0, 1)
+    if layout == "channels first":
+        return pixels
+    pixels = pixels.movedim(-1, -3)
+    return pixels if layout == "channels last" else pixels.flatten(-4, -3)
 
 
-__all__ = ["SafetyWrapper"]
+__all__ = ["SafetyVectorWrapper", "SafetyWrapper"]

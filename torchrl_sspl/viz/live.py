@@ -1,0 +1,478 @@
+"""A live view: picture, barrier, verdict and interventions of an agent at work, on a page served from this machine, and as a film."""
+
+from __future__ import annotations
+
+import base64
+import errno
+import html
+import io
+import json
+import math
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tensordict import TensorDict
+from torch import Tensor
+from torch.nn import functional as F
+
+from torchrl_sspl.configs.reader import EnvFactory, compose
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.evaluation.blocks import described_system
+from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.runtime import CameraFault, Monitor, Shield, Verdict, Watched
+from torchrl_sspl.runtime.monitor import starts
+from torchrl_sspl.sets import UNSAFE
+from torchrl_sspl.viz.live_page import PAGE
+from torchrl_sspl.viz.plane import require
+
+POLICIES = ("own", "random")
+PHYSICS = "physics"
+_UNPROVED_MARGIN = 0.02
+_KEPT = 300  # steps that whoever opens the page is shown at once
+_STARTS, _HORIZON, _HELD = 32, 200, 0.2  # starts that are taken in turn, longest episode, chance of a new random action
+_WIDTH, _HEIGHT = 768, 432
+#: What verdicts are called, and their colours in a film.
+VERDICTS = {
+    Verdict.PROOF_APPLIES: ("Proof applies", "#13702f"),
+    Verdict.INSIDE: ("Inside, premise not met", "#7a5200"),
+    Verdict.OUTSIDE: ("Outside the set", "#b3261e"),
+    Verdict.UNKNOWN_PICTURE: ("Unknown picture", "#7b2d8e"),
+}
+
+
+class Shown(NamedTuple):
+    """What a source shows at a step."""
+
+    pixels: Tensor  # (1, 6, H, W) uint8
+    begins: bool  # whether an episode begins
+    unsafe: bool | None = None  # whether the true state lies in U, where it is known
+
+
+#: Shows, and takes the action ``(1, m)`` that is done.
+Source = Generator[Shown, Tensor, None]
+
+
+def watch(
+    name: str,
+    *,
+    env: str | None = None,
+    video: str | Path | None = None,
+    policy: str = "own",
+    protect: bool = False,
+    record: str | Path | None = None,
+    host: str = "127.0.0.1",
+    port: int = 8000,
+    steps: int | None = None,
+    fps: float | None = None,
+    noise: float = 1.0,
+    seed: int = 0,
+    ready: Callable[[str], Any] = print,
+) -> dict[str, int]:
+    """Runs an agent behind its monitor, and shows it on a page until the steps are over or it is interrupted.
+
+    Episodes begin in {B <= 0} where the system's states are known. Whoever reaches ``host`` and ``port`` can see the page. Source: none.
+
+    Args:
+        name: shipped agent, or run directory with a calibration.
+        env: a system as in ``sspl train env=...``, or ``"physics"``: the agent's own one in full physics; default: the agent's own one.
+        video: film file in place of a system; nothing can be done there, so that what happens is not
+            what the agent expects of its own actions.
+        policy: ``"own"``, or ``"random"``: uniform actions, each held for five steps on average.
+        protect: put the safety filter behind the policy; the margin of an agent without a proof is .02.
+        record: an .mp4 file to write.
+        host, port: where the page is served; port 0: any that is free.
+        steps: after so many it ends; None: it goes on.
+        fps: steps per second; None: as fast as the system itself, or the film; ``inf``: as fast as possible.
+        noise: of the camera of a system, standard deviation in grey levels; shipped calibrations suppose one.
+        seed: of all that is drawn.
+        ready: called with the page's address.
+
+    Returns how many ``steps``, ``interventions``, ``alarms`` (steps) and ``entered`` (episodes into U) there were. Raises ConfigError for
+    arguments that are not valid, a port that is taken or a film that cannot be read; CheckpointError without a calibration;
+    MissingDependencyError without the extra ``viz``.
+    """
+    _check(env, video, policy, protect, record, port, steps, fps, noise)
+    monitor = Monitor.load(name)
+    agent = monitor.agent
+    shield = Shield(agent, margin=None if agent.tolerated_error > 0.0 else _UNPROVED_MARGIN) if protect else None
+    if video is None:
+        source, pace = _of_system(agent, env, noise, seed)
+    else:
+        source, pace = _of_film(Path(video), _size(agent))
+    where = "a film" if video is not None else {None: "its own system", PHYSICS: "full physics"}.get(env, env)
+    about = f"{where}; {'random actions' if policy == 'random' else 'its own actions'}; safety filter {'on' if protect else 'off'}"
+    loop = _Loop(monitor, shield, source, policy == "random", seed)
+    feed = Feed()
+    server = _serve(host, port, feed, PAGE.replace("{{name}}", html.escape(name)).replace("{{about}}", html.escape(about)))
+    film = None
+    try:
+        film = None if record is None else _Film(Path(record), min(fps or pace, 60.0), f"{name}: {about}")
+        ready(f"http://{host}:{server.server_address[1]}/")
+        period, due = 1.0 / (fps or pace), time.monotonic()
+        for event, frame in loop.run(steps):
+            if film is not None:
+                film.add(event, frame)
+            feed.publish(event, picture_data(frame))
+            due = max(due + period, time.monotonic())
+            time.sleep(max(0.0, due - time.monotonic()))
+    except KeyboardInterrupt:
+        pass
+    finally:
+        feed.close()
+        server.shutdown()
+        server.server_close()
+        if film is not None:
+            film.close()
+    return loop.counts
+
+
+def _check(
+    env: str | None, video: str | Path | None, policy: str, protect: bool, record: str | Path | None, port: int,
+    steps: int | None, fps: float | None, noise: float,
+) -> None:  # fmt: skip
+    """A ConfigError for arguments that are not valid."""
+    wrong = (steps is not None and steps < 1) or (fps is not None and not fps > 0.0) or not 0.0 <= noise < math.inf
+    if policy not in POLICIES or not 0 <= port <= 65535 or wrong:
+        raise ConfigError(
+            f"expected policy in {POLICIES}, port in 0..65535, steps >= 1, fps > 0 and noise >= 0, received {policy!r}, {port}, {steps}, "
+            f"{fps} and {noise}"
+        )
+    if video is not None and (env is not None or policy != "own" or protect):
+        raise ConfigError("expected a video alone, received env, policy=random or a filter with it; nothing can be done in a film")
+    if video is not None and not Path(video).is_file():
+        raise ConfigError(f"expected a film file, received '{video}', which is none")
+    if record is not None and Path(record).suffix != ".mp4":
+        raise ConfigError(f"expected a file that ends in .mp4 to record to, received '{record}'")
+    if record is not None:
+        require("imageio_ffmpeg")
+    require("PIL.Image")
+
+
+def _size(agent: Agent) -> tuple[int, int]:
+    size: Any = getattr(agent.encoder, "image_size", None) or (64, 64)
+    return int(size[0]), int(size[1])
+
+
+def _of_system(agent: Agent, env: str | None, noise: float, seed: int) -> tuple[Source, float]:
+    """Pictures of a system, and its steps per second."""
+    factory = described_system(agent.description) if env in (None, PHYSICS) else EnvFactory(compose([f"env={env}"]).env)
+    if factory is None:
+        raise ConfigError("expected an agent that names a system of this library, received another one; name one: --env")
+    made = factory(batch_size=[1], seed=seed)
+    if env == PHYSICS and hasattr(made, "physics"):
+        made = made.known_twin()
+    m = agent.policy.action_scale.numel()  # type: ignore[operator, union-attr]
+    shown, dim = tuple(made.observation_spec["pixels"].shape[-2:]), made.action_spec.shape[-1]
+    if shown != _size(agent) or dim != m:
+        raise ConfigError(
+            f"expected a system with pictures of {_size(agent)} pixels and {m} actions, as this agent's, received {shown} and {dim}"
+        )
+    known = hasattr(made, "dynamics")
+    begin = starts(agent, made, _STARTS, torch.Generator().manual_seed(seed)) if known else None
+    pace = 1.0 / float(getattr(made, "dt", 0.05))
+    camera = CameraFault("dark", 1.0, noise=noise, seed=seed)
+    if env != PHYSICS:
+        return _episodes(made, begin, camera), pace
+    make = made.physics() if known else None
+    if make is None:
+        raise ConfigError(f"expected a system with a full physics, received {type(made).__name__}, which has none; leave --env physics out")
+    return _walks(make(), begin, camera), pace
+
+
+def _episodes(env: Any, begin: Tensor | None, camera: CameraFault) -> Source:
+    """Episodes of a TorchRL environment, from given states or its own resets, through a camera."""
+    k = 0
+    while True:
+        if begin is None:
+            data = env.reset()
+        else:
+            data = env.reset(TensorDict({"state": begin[k % len(begin)][None]}, [1]), set_state=True)
+        k += 1
+        for t in range(_HORIZON):
+            action = yield Shown(camera(data["pixels"], t), t == 0, bool((data["region"] == UNSAFE).any()))
+            data = env.step(data.set("action", action))["next"]
+            if bool(data["done"].any()):
+                break
+
+
+def _walks(world: Any, begin: Tensor | None, camera: CameraFault) -> Source:
+    """Episodes in full physics, through a camera."""
+    assert begin is not None
+    k = 0
+    try:
+        while True:
+            pixels, info = world.reset(options={"pose": begin[k % len(begin)].tolist()})
+            k += 1
+            for t in range(_HORIZON):
+                action = yield Shown(camera(torch.as_tensor(pixels)[None], t), t == 0, bool(info["unsafe"]))
+                pixels, _, terminated, truncated, info = world.step(action[0].numpy())
+                if terminated or truncated:
+                    break
+    finally:
+        world.close()
+
+
+def _of_film(path: Path, size: tuple[int, int]) -> tuple[Source, float]:
+    """Pairs of frames of a film, the middle square of each averaged to a size, and its frames per second."""
+    ffmpeg = require("imageio_ffmpeg")
+    frames = ffmpeg.read_frames(str(path), pix_fmt="rgb24")
+    try:
+        about = next(frames)
+    except (OSError, RuntimeError, StopIteration) as error:
+        raise ConfigError(f"expected a film that can be read, received '{path}': {str(error).strip().splitlines()[-1:]}") from error
+    width, height = about["size"]
+    side = min(width, height)
+    top, left = (height - side) // 2, (width - side) // 2
+
+    def pairs() -> Source:
+        before = None
+        for data in frames:
+            picture = torch.frombuffer(bytearray(data), dtype=torch.uint8).reshape(height, width, 3)
+            square = picture[top : top + side, left : left + side].permute(2, 0, 1)[None].float()
+            frame = F.interpolate(square, size=size, mode="area").round().to(torch.uint8)
+            if before is not None:
+                yield Shown(torch.cat([before[0], frame], 1), before[1])
+            before = frame, before is None
+
+    return pairs(), float(about.get("fps") or 20.0)
+
+
+class _Loop:
+    """Monitor, policy and filter at work on a source; counts what happens."""
+
+    def __init__(self, monitor: Monitor, shield: Shield | None, source: Source, random: bool, seed: int) -> None:
+        self.monitor, self.shield, self.source, self.random = monitor, shield, source, random
+        self.scale: Tensor = monitor.agent.policy.action_scale.flatten()  # type: ignore[operator, union-attr, assignment]
+        self.generator, self.held = torch.Generator().manual_seed(seed), torch.zeros(1, len(self.scale))
+        self.counts = {"steps": 0, "interventions": 0, "alarms": 0, "entered": 0}
+        self.episode, self.was_unsafe, self.missed = 0, False, 0
+
+    def run(self, steps: int | None) -> Iterator[tuple[dict[str, Any], NDArray[np.uint8]]]:
+        """What happens at every step, and the frame ``(H, W, 3)`` that is seen."""
+        try:
+            shown = next(self.source, None)
+            while shown is not None and (steps is None or self.counts["steps"] < steps):
+                action, event = self._step(shown)
+                yield event, shown.pixels[0, 3:].permute(1, 2, 0).numpy()
+                shown = self.source.send(action)
+        except StopIteration:
+            pass  # the film is over
+        finally:
+            self.source.close()
+
+    def _step(self, shown: Shown) -> tuple[Tensor, dict[str, Any]]:
+        if shown.begins:
+            self.monitor.reset()
+            self.episode, self.was_unsafe, self.missed = self.episode + 1, False, 0
+        out, counts = self.monitor.step(shown.pixels), self.counts
+        if self.random and float(torch.rand(1, generator=self.generator)) < _HELD:
+            self.held = (torch.rand(1, len(self.scale), generator=self.generator) * 2 - 1) * self.scale
+        wanted = self.held if self.random else out.action
+        made = None if self.shield is None else self.shield(out.latent, wanted)
+        taken = wanted if made is None else made.action
+        self.monitor.took(taken)
+        intervened = made is not None and bool(made.intervened)
+        counts["steps"] += 1
+        counts["interventions"] += intervened
+        counts["alarms"] += bool(out.alarm)
+        counts["entered"] += bool(shown.unsafe) and not self.was_unsafe
+        self.was_unsafe |= bool(shown.unsafe)
+        self.missed += int(out.verdict) == Verdict.INSIDE
+        label, colour = VERDICTS[Verdict(int(out.verdict))]
+        return taken, {
+            **counts, "step": counts["steps"], "episode": self.episode, "begins": shown.begins, "unsafe": shown.unsafe,
+            "barrier": _number(out.barrier), "verdict": Verdict(int(out.verdict)).name, "label": label, "colour": colour,
+            "why": self._why(out), "alarm": bool(out.alarm), "intervened": intervened, "protected": made is not None,
+            "wanted": [_number(u) for u in wanted[0]], "taken": [_number(u) for u in taken[0]],
+        }  # fmt: skip
+
+    def _why(self, out: Watched) -> str:
+        """The number behind a verdict."""
+        limits, value = self.monitor.calibration.limits, float(out.signals["innovation"])
+        if bool(out.alarm):
+            beyond = [f"{name} {self._beyond(name, out)}" for name in out.reasons[0]]
+            return "; ".join(beyond) or f"clean again; the alarm ends after {self.monitor.clear_after} such steps"
+        if int(out.verdict) == Verdict.OUTSIDE:
+            return f"B = {float(out.barrier):+.3f} > 0"
+        if int(out.verdict) == Verdict.INSIDE:
+            why = "nothing is proved of this agent" if not self.monitor.agent.tolerated_error > 0.0 else f"not met for {self.missed} steps"
+            return f"B = {float(out.barrier):+.3f} <= 0; {why}"
+        seen = "the first picture" if math.isnan(value) else f"innovation {value:.3f} of at most {limits['innovation'][1]:.3f}"
+        return f"B = {float(out.barrier):+.3f} <= 0; {seen}"
+
+    def _beyond(self, name: str, out: Watched) -> str:
+        """A signal and its limit; "" of a fault that has no number."""
+        if name not in out.signals or math.isnan(float(out.signals[name])):
+            return ""
+        value, (low, high) = float(out.signals[name]), self.monitor.calibration.limits[name]
+        return f"{value:.3g} > {high:.3g}" if value > high else f"{value:.3g} < {low:.3g}"
+
+
+def _number(value: Tensor) -> float | None:
+    """For JSON, which has no NaN."""
+    number = float(value)
+    return round(number, 5) if math.isfinite(number) else None
+
+
+class Feed:
+    """What happened last, for any number of readers, each at its own pace. Source: none.
+
+    Example:
+        >>> feed = Feed()
+        >>> feed.publish({"step": 1}, "data:,")
+        >>> feed.close()
+        >>> list(feed.events())
+        [{'step': 1, 'picture': 'data:,'}]
+    """
+
+    def __init__(self) -> None:
+        self._changed, self._open = threading.Condition(), True
+        self._recent: deque[dict[str, Any]] = deque(maxlen=_KEPT)
+        self._count, self._picture = 0, ""
+
+    def publish(self, event: dict[str, Any], picture: str) -> None:
+        """One more event, and the picture that belongs to it."""
+        with self._changed:
+            self._recent.append(event)
+            self._picture = picture
+            self._count += 1
+            self._changed.notify_all()
+
+    def close(self) -> None:
+        """Readers come to an end."""
+        with self._changed:
+            self._open = False
+            self._changed.notify_all()
+
+    def events(self) -> Iterator[dict[str, Any]]:
+        """Events still kept, then those that come, the newest with its picture; who is too slow misses some."""
+        read = 0
+        while True:
+            with self._changed:
+                while self._count == read and self._open:
+                    self._changed.wait()
+                new = list(self._recent)[-(self._count - read) :] if self._count > read else []
+                read, ended, picture = self._count, not self._open, self._picture
+            yield from new[:-1]
+            yield from [event | {"picture": picture} for event in new[-1:]]
+            if ended:
+                return
+
+
+def _serve(host: str, port: int, feed: Feed, page: str) -> ThreadingHTTPServer:
+    """A server of the page in threads of its own."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            if self.path == "/":
+                self._answer(200, "text/html; charset=utf-8", page.encode())
+            elif self.path == "/events":
+                self._stream()
+            else:
+                self._answer(404, "text/plain; charset=utf-8", b"not here\n")
+
+        def _answer(self, status: int, kind: str, body: bytes) -> None:
+            self.send_response(status)
+            self.send_header("Content-Type", kind)
+            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
+                             "img-src data:; connect-src 'self'")  # fmt: skip
+            self.end_headers()
+            self.wfile.write(body)
+
+        def _stream(self) -> None:
+            self.send_response(200)
+            self.send_header("Content-Type", "text/event-stream")
+            self.send_header("Cache-Control", "no-store")
+            self.end_headers()
+            try:
+                for event in feed.events():
+                    self.wfile.write(f"data: {json.dumps(event)}\n\n".encode())
+                self.wfile.write(b"event: end\ndata: {}\n\n")
+            except OSError:
+                pass  # whoever looked has gone
+
+        def log_message(self, *arguments: Any) -> None:
+            """Nothing: the terminal is not for that."""
+
+    try:
+        server = ThreadingHTTPServer((host, port), Handler)
+    except OSError as error:
+        why = "which is taken" if error.errno == errno.EADDRINUSE else f"which cannot be used ({error})"
+        raise ConfigError(f"expected a free port, received {host}:{port}, {why}; choose another with --port, 0 takes any") from error
+    server.daemon_threads = True
+    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True).start()
+    return server
+
+
+def picture_data(frame: NDArray[np.uint8]) -> str:
+    """A frame ``(H, W, 3)`` uint8 as an address that a page can show. Source: none."""
+    file = io.BytesIO()
+    require("PIL.Image").fromarray(frame).save(file, "PNG")
+    return "data:image/png;base64," + base64.b64encode(file.getvalue()).decode()
+
+
+class _Film:
+    """An MP4 of what the page shows, written while it happens."""
+
+    def __init__(self, path: Path, fps: float, title: str) -> None:
+        self.path, self.title = path, title
+        path.parent.mkdir(parents=True, exist_ok=True)
+        output = ["-crf", "24", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1"]
+        style = {"codec": "libx264", "quality": None, "macro_block_size": 2, "output_params": output}
+        self.writer = require("imageio_ffmpeg").write_frames(str(path), (_WIDTH, _HEIGHT), fps=fps, **style)
+        self.writer.send(None)
+        self.recent: deque[dict[str, Any]] = deque(maxlen=_HORIZON)
+        fonts = require("PIL.ImageFont")
+        self.large, self.small = fonts.load_default(24), fonts.load_default(15)
+
+    def add(self, event: dict[str, Any], frame: NDArray[np.uint8]) -> None:
+        """One more picture."""
+        self.recent.append(event)
+        image = require("PIL.Image").new("RGB", (_WIDTH, _HEIGHT), "white")
+        draw = require("PIL.ImageDraw").Draw(image)
+        draw.text((16, 12), self.title, "#5b6470", self.small)
+        image.paste(require("PIL.Image").fromarray(frame).resize((352, 352), 0), (16, 48))
+        draw.text((388, 48), event["label"], event["colour"], self.large)
+        draw.text((388, 82), event["why"][:52], "#1a1f27", self.small)
+        told = f"step {event['step']}   episode {event['episode']}   interventions {event['interventions']}"
+        draw.text((388, 106), told, "#5b6470", self.small)
+        self._curve(draw, (388, 140, 752, 400))
+        self.writer.send(np.asarray(image))
+
+    def _curve(self, draw: Any, box: tuple[int, int, int, int]) -> None:
+        """The barrier over the last steps, the set below its zero line, interventions under it."""
+        left, top, right, bottom = box
+        values = [0.0 if e["barrier"] is None else e["barrier"] for e in self.recent]
+        low, high = min([*values, -0.1]), max([*values, 0.1])
+
+        def place(k: int, value: float) -> tuple[float, float]:
+            return left + (right - left) * k / (_HORIZON - 1), bottom - (bottom - top) * (value - low) / (high - low)
+
+        zero = place(0, 0.0)[1]
+        draw.rectangle((left, zero, right, bottom), fill="#e3f4e6")
+        draw.rectangle((left, zero, right, zero + 1), fill="#1a1f27")
+        draw.text((left + 4, zero - 19), "B = 0", "#1a1f27", self.small)
+        for k, event in enumerate(self.recent):
+            x = place(k, 0.0)[0]
+            if event["begins"]:
+                draw.line((x, top, x, bottom), "#dde1e7", 1)
+            if event["intervened"]:
+                draw.line((x, bottom + 4, x, bottom + 12), "#d55e00", 2)
+            if k and not event["begins"]:
+                draw.line((*place(k - 1, values[k - 1]), *place(k, values[k])), "#0072b2", 2)
+
+    def close(self) -> None:
+        """The file is complete."""
+        self.writer.close()
+
+
+__all__ = ["POLICIES", "Feed", "Shown", "picture_data", "watch"]
