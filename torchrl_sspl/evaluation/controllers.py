@@ -115,6 +115,8 @@ class AgentController:
         agent: frozen agent; its encoder stays on its device.
         driver: a controller on pixels that acts in place of the agent's policy, while the agent watches: its barrier
             values and predictions are those of the actions taken.
+        shield: what changes the driver's actions, ``(latent, actions)`` -> an object with ``action``, such as
+            :class:`~torchrl_sspl.runtime.Shield`.
 
     Example:
         >>> from torchrl_sspl.modules.agent import load
@@ -125,10 +127,10 @@ class AgentController:
 
     reads = "pixels"
 
-    def __init__(self, agent: Agent, driver: Any = None) -> None:
+    def __init__(self, agent: Agent, driver: Any = None, shield: Callable[[Tensor, Tensor], Any] | None = None) -> None:
         self._device = next(agent.barrier.parameters()).device
         self.agent = hosted(agent)
-        self.driver = None if driver is None else as_controller(driver)
+        self.driver, self.shield = None if driver is None else as_controller(driver), shield
         #: Whether ``step`` takes a camera, too.
         self.streams = self.driver is None or getattr(self.driver, "streams", False)
         self._split = hasattr(agent.encoder, "frames") and hasattr(agent.encoder, "head")
@@ -160,6 +162,8 @@ class AgentController:
         else:
             chosen = self.driver.step(observation, rows).action  # type: ignore[arg-type]
             action = chosen if rows is None or self._action is None else self._action.index_copy(0, rows, chosen)
+            if self.shield is not None:
+                action = self.shield(decision.latent, action).action
             self._action = action
         predicted = agent.dynamics(decision.latent, action)
         self._memory.expect(predicted, rows)
