@@ -7,9 +7,9 @@ from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.envs.pendulum import PendulumEnv
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
-from torchrl_sspl.envs.system import Requirement, System
+from torchrl_sspl.envs.system import Opening, Requirement, System
 
 __all__ = [
-    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "PendulumEnv", "PendulumRenderer", "Requirement", "SafetyEnv",
-    "System",
+    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "Opening", "PendulumEnv", "PendulumRenderer", "Requirement",
+    "SafetyEnv", "System",
 ]  # fmt: skip

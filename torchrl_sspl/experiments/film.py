@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,29 +11,20 @@ from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.system import Opening
-from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.evaluation.controllers import AgentController, Camera, Decision
 from torchrl_sspl.evaluation.known import barrier_of
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.modules.agent import Agent
-from torchrl_sspl.runtime import Calibration, Monitor, Shield, Verdict
-from torchrl_sspl.runtime.monitor import SIGNALS
+from torchrl_sspl.runtime import Shield
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.viz.animation import VIEW, Scene, Take
 
 MARGIN = 0.02  # of the filter, for an agent without a proof
-_SECONDS = {True: 10.0, False: 5.0}  # longest scene, in full physics and elsewhere
 _AFTER = 1.2  # s, for which what went wrong is still looked at
 _COLOURS = {"S": (205, 236, 205), "U": (250, 220, 215), "buffer": (255, 255, 255)}
-_GRID = {2: (81, 81), 3: (31, 31, 25)}  # nodes on which B is computed for its zero level
-_TOLD = {
-    Verdict.PROOF_APPLIES: ("in the set, the proof applies", "good"),
-    Verdict.INSIDE: ("inside the set", "good"),
-    Verdict.OUTSIDE: ("outside of the set", "fair"),
-    Verdict.UNKNOWN_PICTURE: ("alarm: unknown picture", "fair"),
-}
-_NOTHING = "without protection"
+_GRID = {2: (61, 61), 3: (25, 25, 17)}  # nodes on which B is computed for its zero level
+_PROVED, _INSIDE, _OUTSIDE = ("inside: the proof applies", "good"), ("inside the safe set", "good"), ("outside of the safe set", "fair")
 
 
 @dataclass
@@ -45,23 +34,27 @@ class Film:
     Args:
         agent: frozen agent, or anything else that acts; without a barrier there is no filter and no verdict.
         env: the system, its own known twin.
-        calibration: of the agent's monitor, which then gives the verdicts; None: the sign of B does.
         fps: pictures per second, in full physics; elsewhere there is one per step.
         world: full physics of the system; None: its dynamics.
+        seconds: of the longest scene.
 
     Source: none.
     """
 
     agent: Any
     env: SafetyEnv
-    calibration: Calibration | None = None
     fps: int = 25
     world: Any = None
+    seconds: float = 5.0
 
     @property
     def rate(self) -> int:
         """Pictures per second."""
-        return self.fps if hasattr(self.world, "motion") else max(1, round(1 / getattr(self.env, "dt", 0.05)))
+        return self.fps if hasattr(self.world, "motion") else max(1, round(1 / self._dt))
+
+    @property
+    def _dt(self) -> float:
+        return float(getattr(self.env, "dt", 0.05))
 
     def scenes(self, openings: Iterable[Opening]) -> Iterator[Scene]:
         """The scenes of some openings, each simulated when it is asked for."""
@@ -71,10 +64,9 @@ class Film:
     def scene(self, opening: Opening, *, seed: int) -> Scene:
         """The same start twice: without protection, and with it."""
         nominal = opening.nominal or (lambda: lambda state: torch.zeros(len(state), self.env.action_dim))
-        alone, name = _NOTHING, "the learned policy"
-        takes = [self._take(alone, opening.start, seed, driver=nominal())]
+        takes = [self._take("without protection", opening.start, seed, driver=nominal())]
         if opening.nominal is None:
-            takes.append(self._take(name, opening.start, seed))
+            takes.append(self._take("the learned policy", opening.start, seed))
         elif isinstance(self.agent, Agent):
             shield = Shield(self.agent, margin=None if self.agent.tolerated_error > 0.0 else MARGIN)
             takes.append(self._take("behind the safety filter", opening.start, seed, driver=nominal(), shield=shield))
@@ -87,21 +79,22 @@ class Film:
             return states, {"B": barrier, "kernel": -arrays["viability"].clamp(-10.0, 10.0)}
         if self.env.state_dim not in _GRID:
             return None
-        states = self.env.state_space.grid(_GRID[self.env.state_dim])
+        states = self.env.state_space.grid(_GRID[self.env.state_dim])  # type: ignore[attr-defined]
         barrier = barrier_of(self.agent, self.env, states)
         return None if barrier is None else (states, {"B": barrier})
 
     def _take(self, name: str, start: Sequence[float], seed: int, *, driver: Any = None, shield: Any = None) -> Take:
-        recorder = None if self.world is None else _Recorder(self.world)
+        alone = driver is not None and shield is None
+        recorder = None if self.world is None else _Recorder(self.world, round(_AFTER / self._dt) if alone else None)
         acts: Any = self.agent
         if driver is not None:
             acts = _Driver(driver, None if recorder is None else recorder.pose)
             acts = AgentController(self.agent, acts, shield) if isinstance(self.agent, Agent) else acts
-        steps = max(1, round(_SECONDS[recorder is not None] / getattr(self.env, "dt", 0.05)))
+        steps = max(1, round(self.seconds / self._dt))
         options: dict[str, Any] = {} if recorder is None else {"seed": seed}
         where: Any = self.env if recorder is None else recorder
         episodes = simulate(acts, where, start=torch.tensor([start]), horizon=steps, film=1, **options)
-        said = self._said(episodes, recorder, ends=driver is not None and shield is None)
+        said = self._said(episodes, recorder, ends=alone)
         if recorder is None or not hasattr(self.world, "motion"):
             return take_of(name, episodes, said, None if recorder is not None else self.env.portrait)
         return self._in_physics(name, episodes, said, recorder)
@@ -109,10 +102,10 @@ class Film:
     def _in_physics(self, name: str, episodes: Episodes, said: list[tuple[str, str]], recorder: _Recorder) -> Take:
         """A take with pictures between the steps."""
         dt = self.world.physics_dt
-        bodies = recorder.bodies[: round((len(said) - 1) * self.env.dt / dt) + 1]  # type: ignore[operator]
+        bodies = recorder.bodies[: round((len(said) - 1) * self._dt / dt) + 1]
         stage = self.world.stage(VIEW, _COLOURS)
         moments = [min(round(k / self.fps / dt), len(bodies) - 1) for k in range(round((len(bodies) - 1) * dt * self.fps) + 1)]
-        step = [min(round(i * dt / self.env.dt - 0.499), len(said) - 1) for i in moments]  # type: ignore[operator]
+        step = [min(round(i * dt / self._dt - 0.499), len(said) - 1) for i in moments]
         poses = [[*bodies[i].position[:2], bodies[i].roll_pitch_yaw[2]] for i in moments]
         shown = episodes.frames[step, 0].permute(0, 2, 3, 1)
         values = None if episodes.barrier is None else episodes.barrier[step, 0]
@@ -120,12 +113,12 @@ class Film:
         return Take(name, pictures, [said[t] for t in step], torch.tensor(poses), values, shown)
 
     def _said(self, episodes: Episodes, recorder: _Recorder | None, ends: bool) -> list[tuple[str, str]]:
-        """What is known at every step: of the true state, or by the monitor or the sign of B.
+        """What is known at every step: what the true state says, or else B.
 
         ``ends``: whether the take ends some time after something went wrong.
         """
         n = int(episodes.alive[:, 0].sum())
-        told = self._verdicts(episodes, recorder, n)
+        told = self._verdicts(episodes, n)
         infos = [{}] * n if recorder is None else recorder.infos
         over, wrong = None, None
         for t in range(n):
@@ -136,25 +129,19 @@ class Film:
                 told[t] = (over or "in the unsafe set U", "bad")
             elif info.get("left") or not bool(self.env.state_space.contains(episodes.states[t, :1, : self.env.state_dim])):
                 told[t] = ("has left the arena: safe", "good") if self.env.exit_region == SAFE else ("has left the space", "bad")
-            if ends and wrong is not None and (t - wrong) * self.env.dt >= _AFTER:  # type: ignore[operator]
+            if ends and wrong is not None and (t - wrong) * self._dt >= _AFTER:
                 return told[: t + 1]
         return told
 
-    def _verdicts(self, episodes: Episodes, recorder: _Recorder | None, n: int) -> list[tuple[str, str]]:
-        if episodes.barrier is None:
+    def _verdicts(self, episodes: Episodes, n: int) -> list[tuple[str, str]]:
+        barrier, seen = episodes.barrier, episodes.seen
+        if barrier is None:
             return [("", "fair")] * n
-        if self.calibration is None:
-            return [_TOLD[Verdict.INSIDE if float(b) <= 0.0 else Verdict.OUTSIDE] for b in episodes.barrier[:n, 0]]
-        # A simulator's camera has no noise: at rest it shows the same picture again and again.
-        monitor, found = Monitor(self.agent, self.calibration, signals=[s for s in SIGNALS if s != "still"]), []
-        before = self.env.draw(self.env.previous_state(episodes.states[0])) if recorder is None else recorder.first
-        for t in range(n):
-            frame = episodes.frames[t]
-            found.append(_TOLD[Verdict(int(monitor.step(torch.cat([before, frame], 1)).verdict))])
-            before = frame
-            if t < len(episodes.actions):
-                monitor.took(episodes.actions[t])
-        return found
+        inside = barrier[:n, 0] <= 0.0
+        proved = torch.zeros(n, dtype=torch.bool)
+        if getattr(self.agent, "held_error", 0.0) > 0.0 and seen is not None:  # every picture so far has to agree
+            proved = (inside & (seen[:n, 0] <= 0.0)).cumprod(0).bool()
+        return [_PROVED if p else _INSIDE if i else _OUTSIDE for p, i in zip(proved.tolist(), inside.tolist(), strict=True)]
 
 
 def take_of(
@@ -170,32 +157,26 @@ def take_of(
     return Take(name, pictures, said, states, values, frames)
 
 
-def calibration_beside(name: str | Path, agent: Any) -> Calibration | None:
-    """The calibration of a monitor that lies beside an agent; None without one."""
-    with contextlib.suppress(CheckpointError):
-        return Calibration.load(name, agent)
-    return None
-
-
 class _Recorder:
-    """A world of which every moment of an episode is kept."""
+    """A world of which every moment of an episode is kept; ``patience``: steps that it goes on after something went wrong."""
 
-    def __init__(self, world: Any) -> None:
-        self.world = world
+    def __init__(self, world: Any, patience: int | None) -> None:
+        self.world, self.patience = world, patience
         self.infos: list[dict[str, Any]] = []
         self.bodies: list[Any] = []
-        self.first: Tensor = torch.zeros(0)
 
     def reset(self, **options: Any) -> tuple[Any, dict[str, Any]]:
         observation, info = self.world.reset(**options)
         self.infos, self.bodies = [info], list(getattr(self.world, "motion", ()))[-1:]
-        self.first = torch.as_tensor(observation[:3])[None].clone()
         return observation, info
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         out = self.world.step(action)
         self.infos.append(out[-1])
         self.bodies += getattr(self.world, "motion", ())
+        wrong = [k for k, info in enumerate(self.infos) if info.get("unsafe") or info.get("contact") or info.get("fallen")]
+        if self.patience is not None and wrong and len(self.infos) - 1 - wrong[0] >= self.patience:
+            return (*out[:3], True, out[-1])
         return out
 
     def pose(self) -> Tensor:
@@ -220,4 +201,4 @@ class _Driver:
         return Decision(self.policy(state))
 
 
-__all__ = ["Film", "calibration_beside", "take_of"]
+__all__ = ["Film", "take_of"]

@@ -16,7 +16,14 @@ import numpy as np
 
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.viz.plane import (
-    BARRIER_COLOUR, KERNEL_COLOUR, PATH_COLOURS, SAFE_FILL, Plane, array, new_figure, require,
+    BARRIER_COLOUR,
+    KERNEL_COLOUR,
+    PATH_COLOURS,
+    SAFE_FILL,
+    Plane,
+    array,
+    new_figure,
+    require,
 )  # fmt: skip
 
 WIDTH, HEIGHT = 768, 432  # pixels of a film; even, as the video codec wants them
@@ -172,6 +179,8 @@ class _Drawing:
             seen.set(xticks=[], yticks=[])
             seen.set_title("what the policy sees", fontsize=9, pad=3)
             self.seen = self._artist(seen, seen.imshow(self.takes[-1].seen[0], interpolation="nearest"))
+            for spine in seen.spines.values():
+                self._artist(seen, spine)
             left = 182
         if not values:
             return
@@ -297,14 +306,12 @@ def _scaled(pictures: Iterable[Any]) -> Iterator[np.ndarray]:
 
 def _with_poster(images: Iterator[np.ndarray], path: Path, fps: int) -> Iterator[np.ndarray]:
     """The images; the one after two seconds, or the last, is kept in a file."""
-    pillow, k, kept = require("PIL.Image"), 0, False
-    for k, image in enumerate(images):  # noqa: B007
-        if k == 2 * fps:
-            pillow.fromarray(image).save(path, quality=88)
-            kept = True
+    poster: np.ndarray | None = None
+    for k, image in enumerate(images):
+        poster = image if k <= 2 * fps else poster
         yield image
-    if not kept:
-        pillow.fromarray(image).save(path, quality=88)
+    if poster is not None:
+        require("PIL.Image").fromarray(poster).save(path, quality=88)
 
 
 def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int) -> None:

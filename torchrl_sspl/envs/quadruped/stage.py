@@ -16,7 +16,7 @@ from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
 
 Colour = tuple[int, int, int]
 _BEHIND, _HEIGHT, _AHEAD, _FOV = 1.55, 1.05, 0.55, 48.0  # m behind and above the robot, m ahead where it looks, degrees
-_FOLLOW = 0.8  # s, in which the camera turns after the robot
+_FOLLOW, _ASIDE = 0.8, 0.3  # s, in which the camera turns after the robot; rad, by which it stands aside
 _SKY, _GRID, _OUTSIDE = (np.array(c, np.float32) for c in ((233, 239, 245), (190, 197, 204), (226, 229, 233)))
 _FAR_AWAY = 12.0  # m, where the ground has faded into the sky
 _TEXEL, _BLUR = 0.01, (3, 7)  # m, of the picture of the ground; texels over which it is averaged far away
@@ -74,7 +74,7 @@ class Stage:
         for body in bodies:
             heading = float(body.roll_pitch_yaw[2])
             turned = heading if turned is None else turned + min(1.0, dt / _FOLLOW) * math.remainder(heading - turned, 2 * math.pi)
-            yield self.picture(body, turned)
+            yield self.picture(body, turned - _ASIDE)
 
     def picture(self, body: Measurement, direction: float) -> NDArray[np.uint8]:
         """A picture uint8 ``(size, size, 3)`` in a direction in rad."""
