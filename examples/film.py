@@ -2,8 +2,8 @@
 
     python examples/film.py [quadruped|pendulum] [FILE]
 
-writes FILE, an mp4 or a gif (default: docs/images/quadruped.gif). Of the quadruped, which walks in full physics, a gif shows
-two scenes at 10 pictures a second, an mp4 all of them at 25. The report of every run begins with such a film of its agent.
+writes FILE, an mp4 or a gif (default: docs/images/quadruped.gif). Of the quadruped, which walks in full physics, an mp4 shows
+all scenes at 25 pictures a second, a gif the last one at 10. The report of every run begins with such a film of its agent.
 """
 
 import sys
@@ -23,7 +23,7 @@ def main(name: str = "quadruped", path: str = "") -> None:
     make = env.physics()
     film = Film(sspl.load(name), env, fps=10 if short else 25, world=make and make(), seconds=10.0 if make else 5.0)
     if short:
-        openings = [openings[0], openings[-1]] if make else openings[1:]
+        openings = openings[-1:] if make else openings[:2]
     plane = Plane.of(env, env.system.state_names[:2])
     found = animate(film.scenes(openings), path, plane=plane, levels=film.levels({}), fps=film.rate)
     print(f"{found}: {found.stat().st_size / 1e6:.1f} MB")

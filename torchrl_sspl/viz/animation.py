@@ -31,7 +31,7 @@ VIEW = 228  # pixels of a picture for people, height and width
 _HOLD = 1.0  # s, for which the last picture of a scene stays
 _ALONE, _MAIN = "#7a7f87", PATH_COLOURS[0]  # what is shown beside the agent, and the agent
 _KINDS = {"good": "#15803d", "fair": "#b45309", "bad": "#b91c1c"}
-_COLOURS = 128  # of a gif
+_COLOURS = 64  # of a gif
 
 
 @dataclass
@@ -69,7 +69,7 @@ def animate(
     scenes: Iterable[Scene], path: str | Path, *, plane: Plane | None = None, levels: tuple[Any, dict[str, Any]] | None = None,
     value_name: str = "B", fps: int = 25,
 ) -> Path:  # fmt: skip
-    """Film of scenes, one after the other; beside it, with the ending .jpg, a picture of it for whoever has not started it yet.
+    """Film of scenes, one after the other; beside an mp4 a picture with the ending .jpg, which is shown before it begins.
 
     Args:
         scenes: what is shown.
@@ -97,7 +97,10 @@ def animate(
         path = path.with_suffix(".gif")
     images = itertools.chain.from_iterable(_Drawing(scene, plane, levels, value_name, fps).images() for scene in scenes)
     path.parent.mkdir(parents=True, exist_ok=True)
-    (_write_mp4 if path.suffix == ".mp4" else _write_gif)(path, _with_poster(images, path.with_suffix(".jpg"), fps), fps)
+    if path.suffix == ".mp4":
+        _write_mp4(path, _with_poster(images, path.with_suffix(".jpg"), fps), fps)
+    else:
+        _write_gif(path, images, fps)
     return path
 
 
