@@ -23,7 +23,7 @@ from torchrl_sspl.viz.animation import VIEW, Scene, Take
 MARGIN = 0.02  # of the filter, for an agent without a proof
 _AFTER = 1.2  # s, for which what went wrong is still looked at
 _COLOURS = {"S": (205, 236, 205), "U": (250, 220, 215), "buffer": (255, 255, 255)}
-_GRID = {2: (61, 61), 3: (25, 25, 17)}  # nodes on which B is computed for its zero level
+_GRID = {2: (61, 61), 3: (25, 25, 13)}  # nodes on which B is computed for its zero level
 _PROVED, _INSIDE, _OUTSIDE = ("inside: the proof applies", "good"), ("inside the safe set", "good"), ("outside of the safe set", "fair")
 
 
@@ -127,6 +127,8 @@ class Film:
             wrong = wrong if wrong is not None or not (over or there == UNSAFE) else t
             if over or there == UNSAFE:
                 told[t] = (over or "in the unsafe set U", "bad")
+            elif ends and wrong is not None:
+                told[t] = ("has been in the unsafe set", "bad")
             elif info.get("left") or not bool(self.env.state_space.contains(episodes.states[t, :1, : self.env.state_dim])):
                 told[t] = ("has left the arena: safe", "good") if self.env.exit_region == SAFE else ("has left the space", "bad")
             if ends and wrong is not None and (t - wrong) * self._dt >= _AFTER:

@@ -157,7 +157,7 @@ class _Drawing:
         axes.tick_params(labelsize=8.5)
         axes.xaxis.label.set_size(9)
         axes.yaxis.label.set_size(9)
-        axes.yaxis.labelpad = -2 if plane.low[plane.coords[1]] < 0 else 2
+        axes.yaxis.labelpad = 1
         self.levels = [] if levels is None else [_Level(plane, levels[0], name, value) for name, value in levels[1].items()]
         for level in self.levels:
             level.lines = self._artist(axes, level.collection())
