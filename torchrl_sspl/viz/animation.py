@@ -337,6 +337,6 @@ def _write_gif(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
     pillow = require("PIL.Image")
     shown = [pillow.fromarray(image) for image in images]
     some = np.concatenate([np.asarray(image) for image in shown[:: max(1, len(shown) // 8)]])
-    palette = pillow.fromarray(some).quantize(_COLOURS)
+    palette = pillow.fromarray(some).quantize(_COLOURS, method=pillow.Quantize.MAXCOVERAGE)  # rare colours too
     pages = [image.quantize(palette=palette, dither=0) for image in shown]
     pages[0].save(path, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0, optimize=False)
