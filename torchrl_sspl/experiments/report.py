@@ -30,7 +30,7 @@ from torchrl_sspl.viz.slices import slices, walks
 REPORT_FILE = "report.html"
 _SHOWN = 40  # episodes whose barrier is drawn
 _POINTS = 20_000  # latents of a grid that are looked at
-_FILM_SECONDS, _WALK_SECONDS = 5.0, 10.0  # of the longest scene of a film, on the true dynamics and in full physics
+_FILM_SECONDS, _WALK_SECONDS = 5.0, 8.0  # of the longest scene of a film, on the true dynamics and in full physics
 _CAPTION = (
     "The same start twice, {}: in grey without protection (no action at all, or a policy that knows nothing of safety), in blue the "
     "learned policy, or that other policy behind the safety filter. The black line in the plane is B = 0."

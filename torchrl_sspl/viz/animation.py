@@ -31,7 +31,7 @@ VIEW = 228  # pixels of a picture for people, height and width
 _HOLD = 1.0  # s, for which the last picture of a scene stays
 _ALONE, _MAIN = "#7a7f87", PATH_COLOURS[0]  # what is shown beside the agent, and the agent
 _KINDS = {"good": "#15803d", "fair": "#b45309", "bad": "#b91c1c"}
-_COLOURS = 64  # of a gif
+_COLOURS = 96  # of a gif
 
 
 @dataclass
@@ -337,6 +337,9 @@ def _write_gif(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
     pillow = require("PIL.Image")
     shown = [pillow.fromarray(image) for image in images]
     some = np.concatenate([np.asarray(image) for image in shown[:: max(1, len(shown) // 8)]])
-    palette = pillow.fromarray(some).quantize(_COLOURS, method=pillow.Quantize.MAXCOVERAGE)  # rare colours too
+    # Half for what is seen most, half for colours that are rare and far apart.
+    parts = [pillow.fromarray(some).quantize(_COLOURS // 2, method=m) for m in (pillow.Quantize.MEDIANCUT, pillow.Quantize.MAXCOVERAGE)]
+    palette = pillow.new("P", (1, 1))
+    palette.putpalette([c for part in parts for c in (part.getpalette() or [])[: 3 * (_COLOURS // 2)]])
     pages = [image.quantize(palette=palette, dither=0) for image in shown]
     pages[0].save(path, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0, optimize=False)
