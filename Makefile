@@ -14,7 +14,7 @@ quadruped: $(VENV)/.quadruped
 
 # The shipped agent in full physics: a film and a report in runs/demo.
 demo: $(VENV)/.quadruped
-	$(BIN)/python examples/quadruped_obstacle.py agent=quadruped evaluation.episodes=0 evaluation.walks=20 out_dir=runs/demo $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python examples/quadruped_obstacle.py agent=quadruped evaluation.episodes=0 evaluation.walks=20 out_dir=runs/demo $(ARGS)
 
 test: $(VENV)/.test
 	$(BIN)/ruff check .

@@ -23,3 +23,15 @@ def test_readme_has_code():
 def test_links_of_the_readme_exist():
     for target in re.findall(r"\]\((?!http)([^)#]+)\)", README.read_text()):
         assert (README.parent / target).exists(), target
+
+
+def test_the_readme_is_short():
+    text = README.read_text()
+    assert len(text.splitlines()) <= 150
+    assert len(text.split()) <= 1200
+
+
+def test_the_film_on_top_is_small_enough_for_a_page():
+    first = re.search(r"!\[[^\]]*\]\(([^)]+)\)", README.read_text())[1]
+    assert first.endswith(".gif")
+    assert (README.parent / first).stat().st_size <= 3_000_000

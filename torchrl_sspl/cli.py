@@ -7,6 +7,7 @@ import json
 import os
 import sys
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -77,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"expected a command, one of {', '.join(commands)}, received '{words[0]}'\n\n{_USAGE}", file=sys.stderr)
         return 2
     try:
-        with interruptible():
+        with nullcontext() if words[0] == "watch" else interruptible():  # an interrupt is how a view is closed
             return commands[words[0]](words[1:])
     except SSPLError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)

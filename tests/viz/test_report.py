@@ -118,6 +118,14 @@ def test_page_parses_and_needs_nothing_from_outside(tmp_path):
     assert base64.b64decode(re.search(r"data:video/mp4;base64,([\w+/=]+)", text)[1]) == b"0000ftypisom"
 
 
+def test_the_film_comes_after_the_verdict_with_the_picture_that_lies_beside_it(tmp_path):
+    assert " poster=" not in full(tmp_path)[1]
+    (tmp_path / "film.jpg").write_bytes(b"picture")
+    parsed, text = full(tmp_path)
+    assert base64.b64decode(re.search(r'poster="data:image/jpeg;base64,([\w+/=]+)"', text)[1]) == b"picture"
+    assert parsed.text.index("Assumed") < parsed.text.index("Film") < parsed.text.index("Requirements")
+
+
 def test_verdict_comes_first_and_counts_rightly(tmp_path):
     parsed, _ = full(tmp_path)
     text = parsed.text

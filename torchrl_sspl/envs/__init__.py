@@ -8,9 +8,9 @@ from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.envs.pendulum import PendulumEnv as PendulumEnv  # not in __all__: TorchRL has one too
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
-from torchrl_sspl.envs.system import Requirement, System
+from torchrl_sspl.envs.system import Opening, Requirement, System
 
 __all__ = [
-    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "PendulumRenderer", "PixelPendulumEnv", "Requirement",
+    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "Opening", "PendulumRenderer", "PixelPendulumEnv", "Requirement",
     "SafetyEnv", "System",
 ]  # fmt: skip

@@ -166,6 +166,10 @@ class SafetyEnv(EnvBase):
         """More renderers by name, ``(n, state_dim)`` -> uint8 ``(n, 3, H, W)``; agents are evaluated on them too."""
         return {}
 
+    def portrait(self, state: Tensor) -> Tensor:
+        """Pictures for people, larger than those of ``draw``: uint8 ``(n, 3, h, w)``; by default those of ``draw``."""
+        return self.draw(state)
+
     def known_twin(self) -> SafetyEnv:
         """System of the same kind whose true kernel is computed, against which its agents are evaluated."""
         return self

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
 from torchrl_sspl.envs.quadruped.compositor import TopViewCompositor
-from torchrl_sspl.envs.system import Requirement, System
+from torchrl_sspl.envs.system import Opening, Requirement, System
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.sets import SAFE, Box, Region
 
@@ -78,6 +78,33 @@ class Disc(Region):
         angle, distance = 2 * math.pi * u[:, :1], self.radius * u[:, 1:].sqrt()
         place = self.centre.to(u) + distance * torch.cat([angle.cos(), angle.sin()], -1)
         return place if self.rest is None else torch.cat([place, self.rest.sample(n, generator, device)], -1)
+
+
+class ThereAndBack:
+    """Heads straight for goals in turn, whatever stands between them: states ``(1, s)`` -> yaw rates ``(1, 1)`` in rad/s.
+
+    Args:
+        goals: places (x, y) in m.
+        max_yaw_rate: in rad/s.
+        near: m, from where a goal is reached.
+
+    Source: none.
+
+    Example:
+        >>> ThereAndBack([(1.0, 0.0), (-1.0, 0.0)], 2.0)(torch.tensor([[0.0, 0.0, 0.0]]))
+        tensor([[0.]])
+    """
+
+    def __init__(self, goals: Sequence[Sequence[float]], max_yaw_rate: float, near: float = 0.45) -> None:
+        self.goals, self.max_yaw_rate, self.near, self._turn = torch.tensor(goals), max_yaw_rate, near, 0
+
+    def __call__(self, state: Tensor) -> Tensor:
+        """Yaw rate towards the present goal."""
+        if float((state[0, :2] - self.goals[self._turn]).norm()) < self.near:
+            self._turn = (self._turn + 1) % len(self.goals)
+        x, y = self.goals[self._turn] - state[0, :2]
+        off = math.remainder(float(torch.atan2(y, x) - state[0, 2]), 2 * math.pi)
+        return torch.tensor([[3.0 * off]]).clamp(-self.max_yaw_rate, self.max_yaw_rate)
 
 
 class DubinsEnv(SafetyEnv):
@@ -191,6 +218,7 @@ class DubinsEnv(SafetyEnv):
         self.obstacle_shape, self.obstacle_half_size = obstacle_shape, float(obstacle_half_size)
         self.obstacle_centre, self.arena_half_size = (centre[0], centre[1]), float(arena_half_size)
         self.safe_half_size, self.unsafe_half_size = float(safe_half_size), float(unsafe_half_size)
+        self.obstacle = obstacle  # what stands on the ground, a set of (x, y)
         # Robots a little outside the arena are still seen.
         self._compositor = TopViewCompositor(
             image_size, obstacle=obstacle, half_view=1.2 * arena_half_size, device=self.device
@@ -209,7 +237,22 @@ class DubinsEnv(SafetyEnv):
             kernel_grid=(101, 101, 72, *((9,) if late else ())),
             unsafe_grid=(61, 61, 36, *((5,) if late else ())),
             notes=(f"{_LATE} {_PHYSICS}" if late else _PHYSICS,),
+            openings=self._openings() if not late else (),
         )
+
+    def _openings(self) -> tuple[Opening, ...]:
+        """From the left: into the middle of the obstacle, past it, from close by, and there and back."""
+        (x, y), unsafe = self.obstacle_centre, self.unsafe_half_size
+        start, far = x - 0.9 * self.arena_half_size, 0.7 * self.arena_half_size
+        return (
+            Opening("Head on", (start, y, 0.0)),
+            Opening("Grazing the unsafe set", (start, y + 0.85 * unsafe, 0.0)),
+            Opening("From the border of the safe set", (x - 0.6 * self.arena_half_size, y - 0.85 * unsafe, 0.0)),
+            Opening(
+                "A goal behind the obstacle, and back", (start, y, 0.0),
+                lambda: ThereAndBack(((x + far, y), (x - far, y)), self.max_yaw_rate),
+            ),
+        )  # fmt: skip
 
     def known_twin(self) -> DubinsEnv:
         """The same car without a yaw lag: its true kernel has three dimensions."""

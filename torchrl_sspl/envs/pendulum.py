@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
-from torchrl_sspl.envs.system import Requirement, System
+from torchrl_sspl.envs.system import Opening, Requirement, System
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.sets import Box, Region
 
@@ -21,6 +21,11 @@ SYSTEM = System(
     state_names=("angle [rad]", "angular velocity [rad/s]"),
     action_name="torque [N m]",
     action_direction=(0.0, 1.0),
+    openings=(
+        Opening("From the border of the safe set", (0.9, -0.9)),
+        Opening("Pushed over with 10 N m", (0.1, 0.0), lambda: lambda state: 10.0 * torch.sign(state[:, :1] + 0.3 * state[:, 1:])),
+        Opening("From the unsafe set, hanging", (math.pi - 0.3, 0.0)),
+    ),
     requirements=(
         Requirement("unsafe_called_safe", "grid of U with B <= 0", "<=", 0.0, 0.0),
         Requirement("safe_called_unsafe", "S with B > 0", "<=", 0.0, 0.0),
@@ -156,6 +161,10 @@ class PixelPendulumEnv(SafetyEnv):
         """RGB frames of states, ``(*batch, 2) -> uint8 (*batch, 3, H, W)``."""
         return self._renderer(state[..., 0])
 
+    def portrait(self, state: Tensor) -> Tensor:
+        """Pictures for people: the same pendulum, large."""
+        return _large_renderer()(state[..., 0].cpu())[..., 100:-100, 100:-100]
+
     @property
     def system(self) -> System:
         """Angle, angular velocity, torque, and what an agent has to reach."""
@@ -164,6 +173,12 @@ class PixelPendulumEnv(SafetyEnv):
     def renderers(self) -> dict[str, Callable[[Tensor], Tensor]]:
         """Gymnasium's own Pendulum-v1 pictures, see ``GymnasiumRenderer``; MissingDependencyError without pygame."""
         return {"gymnasium": lambda state: _gymnasium_renderer(self.image_size)(state[..., 0])}
+
+
+@functools.lru_cache(maxsize=1)
+def _large_renderer() -> PendulumRenderer:
+    """One renderer for people, made when it is first asked for."""
+    return PendulumRenderer(500, snap=False)
 
 
 @functools.lru_cache(maxsize=4)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
+
+from torch import Tensor
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,23 @@ class Requirement:
 
 
 @dataclass(frozen=True)
+class Opening:
+    """How a scene of a film begins: a title, a first state, and what acts in it without protection.
+
+    ``nominal`` makes a policy, true states ``(1, s)`` -> actions ``(1, m)``, that knows nothing of safety; it is shown alone and
+    behind the safety filter. None: no action at all, beside the learned policy. Source: none.
+
+    Example:
+        >>> Opening("Head on", (-1.8, 0.0, 0.0)).nominal is None
+        True
+    """
+
+    title: str
+    start: tuple[float, ...]
+    nominal: Callable[[], Callable[[Tensor], Tensor]] | None = None
+
+
+@dataclass(frozen=True)
 class System:
     """Everything about a system that evaluations and reports need beyond its dynamics, regions and pictures.
 
@@ -53,6 +73,7 @@ class System:
         action_direction: direction of a positive action in the plane of the first two coordinates (a torque pushes the
             angular velocity: ``(0, 1)``), for figures; None: along the path.
         notes: what a report has to say about this system.
+        openings: scenes of its film.
 
     Source: none.
 
@@ -70,3 +91,4 @@ class System:
     unsafe_grid: tuple[int, ...] | None = None
     action_direction: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
+    openings: tuple[Opening, ...] = ()

@@ -33,7 +33,7 @@ def evaluate_physics(
 
     Returns:
         Measurements (shares of episodes with exact bounds; in ``arrays["walks"]`` all episodes, first the closest call,
-        with its frames), and the episodes: those from S, then those from {B <= 0} where there are any.
+        with its frames; in ``arrays["closest"]`` its start and seed), and the episodes: those from S, then those from {B <= 0} where there are any.
 
     Raises:
         ConfigError: the system has no full physics.
@@ -54,7 +54,7 @@ def evaluate_physics(
                 label = f"walks from {where}" if progress else None
                 if len(start):
                     groups.append(simulate(acts, world, start=start, label=label, **options))
-            out.arrays["walks"] = _closest_on_film(acts, world, groups, options)
+            out.arrays["walks"], out.arrays["closest"] = _closest_on_film(acts, world, groups, options)
         finally:
             world.close()
     length = f"walks of at most {config.walk_seconds:g} s from"
@@ -81,17 +81,21 @@ def _steps(env: SafetyEnv, config: EvaluationConfig) -> int:
     return max(1, round(config.walk_seconds / env.dt))  # type: ignore[operator]
 
 
-def _closest_on_film(acts: Controller, world: Any, groups: list[Episodes], options: dict[str, Any]) -> Episodes:
-    """All episodes; first the one whose barrier came highest (the very first without one), once more and filmed."""
+def _closest_on_film(
+    acts: Controller, world: Any, groups: list[Episodes], options: dict[str, Any]
+) -> tuple[Episodes, tuple[list[float], int]]:
+    """All episodes; first the one whose barrier came highest (the very first without one), once more and filmed; its start and
+    seed."""
     every, lengths = groups[0].joined(*groups[1:]), [len(group) for group in groups]
     chosen = 0
     if every.barrier is not None:
         chosen = int(torch.where(every.alive, every.barrier, -torch.inf).amax(0).argmax())
     number = chosen if chosen < lengths[0] else chosen - lengths[0]  # each group counts its seeds anew
     start = every.states[0, chosen][None]
-    again = simulate(acts, world, start=start, film=1, **(options | {"seed": options["seed"] + number}))
+    seed = options["seed"] + number
+    again = simulate(acts, world, start=start, film=1, **(options | {"seed": seed}))
     rest = torch.arange(len(every)) != chosen
-    return again.joined(every.select(rest)) if bool(rest.any()) else again
+    return again.joined(every.select(rest)) if bool(rest.any()) else again, (start[0].tolist(), seed)
 
 
 def _starts_inside(acts: Controller, twin: SafetyEnv, n: int, generator: torch.Generator) -> Tensor:

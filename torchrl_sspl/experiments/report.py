@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -12,12 +13,13 @@ import torch
 from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.certification.rounding import down
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.system import Opening
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.evaluation.outcome import Outcome
-from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.evaluation.simulation import Episodes
+from torchrl_sspl.experiments.film import Film, take_of
 from torchrl_sspl.sets import SAFE, UNSAFE
-from torchrl_sspl.trainers.loggers import encode_gif
-from torchrl_sspl.viz.animation import animate
+from torchrl_sspl.viz.animation import Scene, animate
 from torchrl_sspl.viz.certificate import certificate_section, proved_lines
 from torchrl_sspl.viz.curves import training_curves
 from torchrl_sspl.viz.figures import frames, latent_space, state_plane, trajectories
@@ -28,7 +30,11 @@ from torchrl_sspl.viz.slices import slices, walks
 REPORT_FILE = "report.html"
 _SHOWN = 40  # episodes whose barrier is drawn
 _POINTS = 20_000  # latents of a grid that are looked at
-_FILM_SIZE, _FILM_STEPS = 240, 120  # pixels, at least; steps, at most
+_FILM_SECONDS, _WALK_SECONDS = 5.0, 8.0  # of the longest scene of a film, on the true dynamics and in full physics
+_CAPTION = (
+    "The same start twice, {}: in grey without protection (no action at all, or a policy that knows nothing of safety), in blue the "
+    "learned policy, or that other policy behind the safety filter. The black line in the plane is B = 0."
+)
 _ASSUMED = (
     "The environment, its pictures and its resets stay as they were during the evaluation.",
     "Episodes are independent; observations within one are not, and carry no bound.",
@@ -192,45 +198,47 @@ def _of_episodes(arrays: dict[str, Any], barrier: Any) -> dict[str, Any]:
 
 
 def _film(outcome: Outcome, env: SafetyEnv | None, folder: Path) -> tuple[Path | None, str]:
-    """Film of one episode and what it shows: in full physics, on the true dynamics, or as the agent sees it."""
-    arrays = outcome.evaluations["own"].arrays
+    """Film of a run and what it shows: in full physics where there was any, on the true dynamics, or as the agent sees it."""
+    arrays, path = outcome.evaluations["own"].arrays, folder / "episode.mp4"
     if env is None:
-        return _seen(arrays["own"], folder / "episode.gif"), "One episode, as the agent sees it."
-    twin = env.known_twin()
-    in_physics = arrays.get("walks")
-    if in_physics is not None and in_physics.frames is not None:
-        episodes, text = in_physics, "The closest call in full physics"
-    elif arrays.get("recovery") is not None and arrays["recovery"].shape[1]:
-        start, steps = arrays["recovery"][0, :1], min(len(arrays["recovery"]) - 1, _FILM_STEPS)
-        episodes, text = simulate(outcome.agent, twin, start=start, horizon=steps, film=1), "From U back into the safe set"
+        return _recorded(arrays["own"], path, "One fresh episode"), "One fresh episode, as the agent sees it."
+    twin, e = env.known_twin(), outcome.config.evaluation
+    in_physics, closest = arrays.get("walks"), arrays.get("closest")
+    if closest is None and in_physics is not None and in_physics.frames is not None:
+        text = "The closest call in full physics"
+        return _recorded(in_physics, path, text, twin), f"{text}: what the agent sees, the true state, and the barrier value."
+    openings, dt = list(twin.system.openings), getattr(twin, "dt", 0.05)
+    film = Film(outcome.agent, twin, seconds=min(_FILM_SECONDS, e.horizon * dt))
+    if closest is not None:
+        make = twin.physics()
+        film.world, film.seconds = make and make(), min(_WALK_SECONDS, e.walk_seconds)
     else:
-        return None, ""
-    if twin.state_dim < 2:
-        return _seen(episodes, folder / "episode.gif"), f"{text}, as the agent sees it."
-    last = max(2, int(episodes.alive[:, 0].sum()))
-    path = animate(
-        episodes.states[:last, 0],  # type: ignore[index]
-        episodes.frames[:last, 0],  # type: ignore[index]
-        None if episodes.barrier is None else episodes.barrier[:last, 0],
-        episodes.actions[: last - 1, 0],
-        folder / "episode.mp4",
-        plane=_plane(twin),
-        background=(arrays["states"], arrays["barrier"]) if arrays.get("barrier") is not None else None,
-        action_name=env.system.action_name,
-        fps=max(1, round(1 / getattr(env, "dt", 0.05))),
-        title=text,
-    )
-    return path, f"{text}: what the agent sees, the true state, and the barrier value."
+        for name, title in (("recovery", "From U back into the safe set"), ("trajectories", "From the safe set")):
+            if not openings and arrays.get(name) is not None and arrays[name].shape[1]:
+                openings.append(Opening(title, tuple(arrays[name][0, 0].tolist())))
+        if not openings or arrays.get("trajectories") is None:
+            return None, ""
+    try:
+        scenes = film.scenes(openings)
+        if closest is not None and in_physics is not None:
+            last = Opening(f"The closest of {len(in_physics)} measured walks", tuple(closest[0]))
+            scenes = itertools.chain(scenes, (film.scene(last, seed=closest[1]) for _ in range(1)))
+        plane = _plane(twin) if twin.state_dim > 1 else None
+        path = animate(scenes, path, plane=plane, levels=film.levels(arrays) if plane else None, fps=film.rate)
+    finally:
+        if film.world is not None:
+            film.world.close()
+    return path, _CAPTION.format("in full physics" if closest is not None else "on the true dynamics")
 
 
-def _seen(episodes: Episodes, path: Path) -> Path | None:
-    """Film of what the first episode shows, large enough to be looked at."""
+def _recorded(episodes: Episodes, path: Path, title: str, twin: SafetyEnv | None = None) -> Path | None:
+    """Film of the first of some episodes, from what was kept of it."""
     if episodes.frames is None:
         return None
-    pictures = episodes.frames[episodes.alive[:, 0], 0]
-    larger = max(1, _FILM_SIZE // pictures.shape[-1])
-    path.write_bytes(encode_gif(pictures.repeat_interleave(larger, -1).repeat_interleave(larger, -2)))
-    return path
+    told = [("", "fair")] * int(episodes.alive[:, 0].sum())
+    plane = _plane(twin) if twin is not None and twin.state_dim > 1 else None
+    fps = max(1, round(1 / getattr(twin, "dt", 0.1)))
+    return animate([Scene(title, [take_of("what the policy sees", episodes, told)])], path, plane=plane, fps=fps)
 
 
 def _notes(outcome: Outcome, env: SafetyEnv | None) -> list[str]:

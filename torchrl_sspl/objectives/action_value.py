@@ -13,7 +13,7 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, trained_action
 
 
 def interpolate(table: Tensor, action: Tensor, *, action_scale: float | Tensor) -> Tensor:
@@ -109,6 +109,6 @@ class ActionValueLoss(LatentLoss):
 
     def terms(self, batch: LatentBatch, table: Tensor) -> dict[str, Tensor]:
         """The same for latents that have been read: what a loop of thousands of small steps calls."""
-        action = self._action(batch.latent)
+        action = trained_action(self, batch.latent)
         short = table.amax(-1, keepdim=True) - interpolate(table, action, action_scale=self.action_scale)
         return {"loss_action_value": self._reduce(short / self.scale, batch, worst=True)}

@@ -119,6 +119,19 @@ def _clean(value: Any, valid: Tensor | None) -> Any:
     return torch.where(valid.reshape(shape), value, 0.0)
 
 
+def trained_action(loss: LatentLoss, latent: Tensor) -> Tensor:
+    """Actions of the policy in training; one that gets no gradient is a ConfigError."""
+    action = loss._run("actor_network", latent)
+    if action.requires_grad or not torch.is_grad_enabled() or is_compiling():
+        return action
+    if any(p.requires_grad for p in loss.actor_network_params.parameters()):
+        raise ConfigError(
+            "expected an actor whose actions carry a gradient to its weights, received one without (an argmax, or samples of a "
+            "discrete distribution); give it a deterministic or reparameterised one: actions pass through the dynamics"
+        )
+    return action
+
+
 class LatentLoss(LossModule):
     r"""Base of the losses on latents; not used on its own.
 
@@ -321,18 +334,6 @@ class LatentLoss(LossModule):
         # TensorDict's own selection takes a batch without optional entries for a keyword call, and fails.
         self._out_keys_apparent = list(out_keys)
         return self
-
-    def _action(self, latent: Tensor) -> Tensor:
-        """Actions of the policy in training; one that cannot be trained this way is refused."""
-        action = self._run("actor_network", latent)
-        if action.requires_grad or not torch.is_grad_enabled() or is_compiling():
-            return action
-        if any(p.requires_grad for p in self.actor_network_params.parameters()):
-            raise ConfigError(
-                "expected an actor whose actions carry a gradient to its weights, received one without (an argmax, or samples of a "
-                "discrete distribution); give it a deterministic or reparameterised one: actions pass through the dynamics"
-            )
-        return action
 
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""

@@ -11,7 +11,7 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.objectives.base import LatentLoss
+from torchrl_sspl.objectives.base import LatentLoss, trained_action
 
 
 class CounterexampleLoss(LatentLoss):
@@ -70,7 +70,7 @@ class CounterexampleLoss(LatentLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss on a batch of latents; the batch is not changed."""
         batch = self._read(tensordict)
-        after = self._run("dynamics", batch.latent, self._action(batch.latent), params="frozen")
+        after = self._run("dynamics", batch.latent, trained_action(self, batch.latent), params="frozen")
         if self.error:
             after = after + worst_error(lambda z: self._run("barrier", z, params="frozen"), after, self.error)
         violation = (self._run("barrier", after, params="frozen") + self.dynamics_margin).clamp_min(0.0)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import policy_deviation
-from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, _clean
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, _clean, trained_action
 
 
 class PolicyDeviationLoss(LatentLoss):
@@ -76,7 +76,7 @@ class PolicyDeviationLoss(LatentLoss):
 
     def _deviation_terms(self, batch: LatentBatch) -> dict[str, Tensor]:
         latent = batch.latent.detach() if "encoder" in self.detach else batch.latent
-        action = self._action(latent)
+        action = trained_action(self, latent)
         user = torch.zeros_like(action) if batch.user_action is None else batch.user_action
         return {"loss_policy_deviation": self._reduce(policy_deviation(action, user), batch)}
 

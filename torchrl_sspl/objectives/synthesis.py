@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import synthesis_violation
-from torchrl_sspl.objectives.base import LatentBatch, LatentLoss
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, trained_action
 from torchrl_sspl.sets import UNSAFE
 
 MODES = ("R3", "R1", "R2", "paper")
@@ -157,7 +157,7 @@ class SynthesisLoss(LatentLoss):
         if stray:
             uniform = torch.rand_like(latent) * 2.0 - 1.0
             origin, at = torch.stack([latent, uniform]), torch.stack([start, uniform])
-        action = self._action(origin)
+        action = trained_action(self, origin)
         successor = self._run("dynamics", at, action, params="frozen" if "dynamics" in self.detach else "online")
         if batch.residual is not None:
             # Uniform latents have no observed error.
@@ -184,7 +184,7 @@ class SynthesisLoss(LatentLoss):
             terms["loss_growth"] = self.growth_coeff * self._reduce(grow, batch)
         if "descent_coeff" in self._active:
             still = latent.detach()
-            ahead = self._run("dynamics", still, self._action(still), params="frozen")
+            ahead = self._run("dynamics", still, trained_action(self, still), params="frozen")
             weight = (-barrier.detach().clamp_min(0.0) / self.descent_scale).exp()
             descent = weight * self._run("barrier", ahead, params="frozen")
             terms["loss_descent"] = self.descent_coeff * self._reduce(descent, batch)

@@ -13,7 +13,7 @@ from torch import nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import safe_hinge, unsafe_hinge
-from torchrl_sspl.objectives.base import LatentLoss
+from torchrl_sspl.objectives.base import LatentLoss, trained_action
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 
@@ -108,7 +108,7 @@ class TargetLoss(LatentLoss):
         residual = (barrier - target).square() * self.inside_coeff
         near = (-target.abs() / self.scale).exp() + 0.1
         fit = near * residual.where(inside, short.square())
-        action = self._action(batch.latent)
+        action = trained_action(self, batch.latent)
         wanted = self._counted(tensordict, keys.action_target, "action_target", batch)
         gap = (action - wanted) / self.action_scale
         weight = self._counted(tensordict, keys.action_weight, "action_weight", batch)

@@ -1,126 +1,320 @@
-"""Animation of one episode: what the agent sees, where the true state is, and what the barrier says."""
+"""Films: an episode beside what happens without protection, the true state in its plane, and the barrier over time."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import itertools
+import math
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.viz.plane import BARRIER_COLOUR, PATH_COLOURS, Plane, array, new_figure, require, zero_level
+from torchrl_sspl.viz.plane import (
+    BARRIER_COLOUR,
+    KERNEL_COLOUR,
+    PATH_COLOURS,
+    SAFE_FILL,
+    Plane,
+    array,
+    new_figure,
+    require,
+)  # fmt: skip
 
-_WIDTH, _HEIGHT, _DPI = 9.6, 5.4, 80  # 768 x 432 pixels: even, as the video codec wants them
+WIDTH, HEIGHT = 768, 432  # pixels of a film; even, as the video codec wants them
+VIEW = 228  # pixels of a picture for people, height and width
+_HOLD = 1.0  # s, for which the last picture of a scene stays
+_ALONE, _MAIN = "#7a7f87", PATH_COLOURS[0]  # what is shown beside the agent, and the agent
+_KINDS = {"good": "#15803d", "fair": "#b45309", "bad": "#b91c1c"}
+_COLOURS = 96  # of a gif
+
+
+@dataclass
+class Take:
+    """One episode as it is filmed, K pictures.
+
+    Args:
+        name: what acts.
+        pictures: K pictures for people, uint8 ``(H, W, 3)``; drawn when they are asked for.
+        said: K pairs: what is known at a picture, and whether it is "good", "fair" or "bad" news.
+        states: ``(K, dim)`` true states; None where they are not known.
+        values: ``(K,)`` barrier values, or whatever is shown over time.
+        seen: ``(K, h, w, 3)`` uint8 what the agent sees; None where the pictures are that.
+
+    Source: none.
+    """
+
+    name: str
+    pictures: Iterable[Any]
+    said: Sequence[tuple[str, str]]
+    states: Any = None
+    values: Any = None
+    seen: Any = None
+
+
+@dataclass
+class Scene:
+    """A title, and one or two takes from the same start, the agent's last. Source: none."""
+
+    title: str
+    takes: list[Take]
 
 
 def animate(
-    states: Any,
-    frames: Any,
-    barrier: Any,
-    actions: Any,
-    path: str | Path,
-    *,
-    plane: Plane,
-    background: tuple[Any, Any] | None = None,
-    action_name: str = "action",
-    fps: int = 20,
-    title: str = "",
-) -> Path:
-    """Film of one closed-loop episode: the frame seen, the path in the state plane, the barrier value below.
+    scenes: Iterable[Scene], path: str | Path, *, plane: Plane | None = None, levels: tuple[Any, dict[str, Any]] | None = None,
+    value_name: str = "B", fps: int = 25,
+) -> Path:  # fmt: skip
+    """Film of scenes, one after the other; beside an mp4 a picture with the ending .jpg, which is shown before it begins.
 
     Args:
-        states: ``(T + 1, dim)`` true states.
-        frames: ``(T + 1, 3, H, W)`` uint8 what was seen of them.
-        barrier: ``(T + 1,)`` barrier values; None: the action is shown below instead.
-        actions: ``(T, m)``, T >= 1; the first component is shown.
+        scenes: what is shown.
         path: the file to write, ``.mp4`` or ``.gif``.
-        plane: the coordinates shown.
-        background: grid states ``(k, dim)`` and their barrier values ``(k,)``, of which the zero level is drawn.
-        action_name: name and unit of the action.
+        plane: the coordinates shown, with S, U and the obstacle; None: no plane.
+        levels: grid states ``(n, dim)`` and, by name, values ``(n,)`` of which the zero level is drawn: ``"B"``, ``"kernel"``. Of
+            three coordinates the third is that of the agent at the moment.
+        value_name: of the values over time, with unit.
         fps: pictures per second.
-        title: what is shown.
 
-    Returns the file written: without ``imageio-ffmpeg`` an mp4 becomes a gif, with a warning. Raises ShapeError,
-    NonFiniteError or ConfigError for another argument or file name. Source: paper Section V, figures "sspl_pend" and
-    "traj_sspl_gr"; deviation: they move, and B is shown.
+    Returns the film: without ``imageio-ffmpeg`` an mp4 becomes a gif, with a warning. Raises ShapeError, NonFiniteError or
+    ConfigError for another argument or file name. Source: paper Section V, figures "sspl_pend" and "traj_sspl_gr"; deviation:
+    they move, B and its zero level are shown, and what happens without protection.
 
     Example:
-        >>> plane, pictures = Plane(("x", "v"), [-1, -1], [1, 1]), torch.zeros(3, 3, 8, 8, dtype=torch.uint8)
-        >>> animate(torch.zeros(3, 2), pictures, torch.zeros(3), torch.zeros(2, 1), "film.gif", plane=plane).name
+        >>> take = Take("policy", [np.zeros((8, 8, 3), np.uint8)] * 2, [("inside", "good")] * 2, values=[-0.2, -0.1])
+        >>> animate([Scene("Demo", [take])], "film.gif").name
         'film.gif'
     """
     path = Path(path)
     if path.suffix not in (".mp4", ".gif"):
         raise ConfigError(f"path: expected a file name that ends in .mp4 or .gif, received '{path.name}'.")
-    x, u = array("states", states, (None, plane.dim)), array("actions", actions, (None, None))
-    if len(u) < 1 or len(x) != len(u) + 1:
-        raise ShapeError(f"states and actions: expected T + 1 and T >= 1 rows, received {len(x)} and {len(u)}.")
-    pictures = array("frames", frames, (len(x), 3, None, None)).astype(np.uint8).transpose(0, 2, 3, 1)
-    values = None if barrier is None else array("barrier", barrier, (len(x),))
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         warnings.warn("imageio-ffmpeg is not installed; the film becomes a gif.", stacklevel=2)
         path = path.with_suffix(".gif")
-    shown = np.append(u[:, 0], u[-1, 0])  # of the last state no action was asked
-    images = _images((x[:, list(plane.coords)], pictures, values, shown), plane, background, action_name, title)
+    images = itertools.chain.from_iterable(_Drawing(scene, plane, levels, value_name, fps).images() for scene in scenes)
     path.parent.mkdir(parents=True, exist_ok=True)
-    (_write_mp4 if path.suffix == ".mp4" else _write_gif)(path, images, fps)
+    if path.suffix == ".mp4":
+        _write_mp4(path, _with_poster(images, path.with_suffix(".jpg"), fps), fps)
+    else:
+        _write_gif(path, images, fps)
     return path
 
 
-def _images(
-    episode: tuple[np.ndarray, np.ndarray, np.ndarray | None, np.ndarray], plane: Plane,
-    background: tuple[Any, Any] | None, action_name: str, title: str,
-) -> Iterator[np.ndarray]:  # fmt: skip
-    """RGB pictures of the film; what does not move is drawn once."""
-    points, pictures, barrier, actions = episode
-    values = actions if barrier is None else barrier
-    figure = new_figure(_WIDTH, _HEIGHT)
-    figure.set_dpi(_DPI)
-    grid = figure.add_gridspec(2, 2, width_ratios=(1, 1.35), height_ratios=(2.4, 1))
-    seen, where, below = (figure.add_subplot(grid[k]) for k in ((0, 0), (0, 1), (1, slice(None))))
-    if title:
-        figure.suptitle(title, fontsize=11)
-    seen.set(xticks=[], yticks=[], title="seen by the agent", frame_on=False)
-    plane.draw(where, cover=points)
-    where.set_title("true state")
-    if background is not None:
-        x, y, table = plane.grid(background[0], {"barrier": background[1]})
-        zero_level(where, x, y, table["barrier"], colors=BARRIER_COLOUR, linewidths=1.6)
-    low, high = min(values.min(), 0.0), max(values.max(), 0.0)
-    room = 0.08 * (high - low) + 1e-3
-    steps = np.arange(len(values))
-    if barrier is not None:
-        below.axhspan(low - room, 0, color="#cdeccd", linewidth=0)
-    below.axhline(0, color=BARRIER_COLOUR, linewidth=1.0)
-    below.set(xlim=(0, max(1, len(values) - 1)), ylim=(low - room, high + room), xlabel="step")
-    below.set_ylabel("B(z)" if barrier is not None else action_name)
+class _Drawing:
+    """A scene on a figure; what does not move is drawn once."""
 
-    image = seen.imshow(pictures[0], interpolation="nearest", animated=True)
-    (track,) = where.plot([], [], color=PATH_COLOURS[0], linewidth=1.6, animated=True)
-    (dot,) = where.plot([], [], "o", color=PATH_COLOURS[1], markersize=8, markeredgecolor="white", animated=True)
-    (curve,) = below.plot([], [], color=PATH_COLOURS[0], linewidth=1.6, animated=True)
-    (now,) = below.plot([], [], "o", color=PATH_COLOURS[1], markersize=6, animated=True)
-    text = below.text(0.995, 0.93, "", transform=below.transAxes, ha="right", va="top", fontsize=9, animated=True)
-    figure.canvas.draw()
-    figure.set_layout_engine("none")
-    still = figure.canvas.copy_from_bbox(figure.bbox)  # type: ignore[attr-defined]
-    for t in steps:
-        figure.canvas.restore_region(still)  # type: ignore[attr-defined]
-        image.set_data(pictures[t])
-        track.set_data(*plane.unwrap_breaks(points[: t + 1]).T)
-        dot.set_data(points[t, :1], points[t, 1:])
-        curve.set_data(steps[: t + 1], values[: t + 1])
-        now.set_data(steps[t : t + 1], values[t : t + 1])
-        said = "" if barrier is None else f"B = {values[t]:+.3f}   "
-        text.set_text(f"{said}{action_name}: {actions[t]:+.2f}")
-        for axes, artists in ((seen, (image,)), (where, (track, dot)), (below, (curve, now, text))):
-            for artist in artists:
-                axes.draw_artist(artist)
-        yield np.asarray(figure.canvas.buffer_rgba())[..., :3].copy()  # type: ignore[attr-defined]
+    def __init__(self, scene: Scene, plane: Plane | None, levels: Any, value_name: str, fps: int) -> None:
+        if not 1 <= len(scene.takes) <= 2:
+            raise ShapeError(f"scene '{scene.title}': expected one or two takes, received {len(scene.takes)}.")
+        self.takes, self.fps, self.plane = [_checked(take, plane) for take in scene.takes], fps, plane
+        self.length = max(len(take.said) for take in self.takes)
+        self.figure = new_figure(WIDTH / 80, HEIGHT / 80)
+        self.figure.set_layout_engine("none")
+        self.figure.set_dpi(80)
+        self.figure.text(12 / WIDTH, 1 - 20 / HEIGHT, scene.title, fontsize=13, fontweight="bold", va="center")
+        self.moving: list[tuple[Any, Any]] = []  # axes (None: the figure) and artist, in the order in which they are drawn
+        self.clock = self._text(None, 1 - 12 / WIDTH, 1 - 20 / HEIGHT, ha="right", va="center", fontsize=11)
+        slots = len(self.takes) + (plane is not None)
+        edges = [(WIDTH - slots * VIEW) / (slots + 1) * (k + 1) + k * VIEW for k in range(slots)] if slots < 3 else [10, 246, 532]
+        self.views = [self._view(take, edge, colour) for take, edge, colour in zip(self.takes, edges, self._colours(), strict=False)]
+        if plane is not None:
+            self._draw_plane(plane, levels, edges[-1])
+        self._draw_values(value_name)
+
+    def _colours(self) -> list[str]:
+        return [_ALONE, _MAIN][-len(self.takes) :]
+
+    def _axes(self, x: float, y: float, width: float, height: float) -> Any:
+        return self.figure.add_axes((x / WIDTH, y / HEIGHT, width / WIDTH, height / HEIGHT))
+
+    def _artist(self, axes: Any, artist: Any) -> Any:
+        artist.set_animated(True)
+        self.moving.append((axes, artist))
+        return artist
+
+    def _text(self, axes: Any, x: float, y: float, **style: Any) -> Any:
+        return self._artist(axes, (axes or self.figure).text(x, y, "", **({"transform": axes.transAxes} if axes else {}), **style))
+
+    def _view(self, take: Take, x: float, colour: str) -> tuple[Any, Any, Any]:
+        axes = self._axes(x, 144, VIEW, VIEW)
+        axes.set(xticks=[], yticks=[])
+        axes.set_title(take.name, fontsize=10.5, color=colour, fontweight="bold", pad=4)
+        blank = np.full((VIEW, VIEW, 3), 255, np.uint8)
+        image = self._artist(axes, axes.imshow(blank, interpolation="antialiased", extent=(0, 1, 0, 1)))
+        box = {"boxstyle": "round,pad=0.3", "facecolor": "white", "alpha": 0.92, "linewidth": 1.2}
+        for spine in axes.spines.values():
+            self._artist(axes, spine)
+        said = self._text(axes, 0.03, 0.04, fontsize=10, fontweight="bold", ha="left", va="bottom", bbox=box)
+        return axes, image, said
+
+    def _draw_plane(self, plane: Plane, levels: Any, x: float) -> None:
+        axes = self._axes(x, 170, 206 if len(self.takes) > 1 else VIEW, 206)
+        plane.draw(axes, cover=self.takes[-1].states[:, list(plane.coords)])
+        axes.tick_params(labelsize=8.5)
+        axes.xaxis.label.set_size(9)
+        axes.yaxis.label.set_size(9)
+        axes.yaxis.labelpad = 1
+        self.levels = [] if levels is None else [_Level(plane, levels[0], name, value) for name, value in levels[1].items()]
+        for level in self.levels:
+            level.lines = self._artist(axes, level.collection())
+            axes.add_collection(level.lines)
+        turns = plane.dim >= 3 and math.isclose(plane.period[2], 2 * math.pi, rel_tol=1e-4)
+        units = [name.partition("[")[2] for name in plane.names]
+        self.headings = turns and bool(units[0]) and units[0] == units[1]
+        axes.set_title("true state; line: B = 0" + (" at this heading" if self.headings else ""), fontsize=10.5, pad=4)
+        self.tracks = []
+        for colour in self._colours():
+            (track,) = axes.plot([], [], color=colour, linewidth=1.8)
+            (dot,) = axes.plot([], [], "o", color=colour, markersize=8, markeredgecolor="white")
+            arrow = axes.quiver([0], [0], [0], [0], color=colour, scale=7.5, width=0.016, headwidth=3.6, zorder=6)
+            self.tracks.append(tuple(self._artist(axes, a) for a in (track, arrow, dot)))
+
+    def _draw_values(self, name: str) -> None:
+        values = [take.values for take in self.takes if take.values is not None]
+        self.curves: list[Any] = []
+        left = 58
+        if self.takes[-1].seen is not None:
+            seen = self._axes(12, 8, 104, 104)
+            seen.set(xticks=[], yticks=[])
+            seen.set_title("what the policy sees", fontsize=9, pad=3)
+            self.seen = self._artist(seen, seen.imshow(self.takes[-1].seen[0], interpolation="nearest"))
+            for spine in seen.spines.values():
+                self._artist(seen, spine)
+            left = 182
+        if not values:
+            return
+        axes = self._axes(left, 36, WIDTH - left - 16, 76)
+        low, high = min(0.0, *(v.min() for v in values)), max(0.0, *(v.max() for v in values))
+        room = 0.12 * (high - low) + 1e-3
+        axes.set(xlim=(0, max(1, self.length - 1) / self.fps), ylim=(low - room, high + room))
+        if name == "B":
+            axes.axhspan(low - room, 0, color=SAFE_FILL, linewidth=0)
+        axes.axhline(0, color=BARRIER_COLOUR, linewidth=1.0)
+        axes.set_xlabel("time [s]", fontsize=9, labelpad=1)
+        axes.set_ylabel(name, fontsize=9)
+        axes.set_title("barrier B: inside the set while it is at most 0" if name == "B" else name, fontsize=9, pad=3)
+        axes.tick_params(labelsize=8.5)
+        for colour in self._colours():
+            (curve,) = axes.plot([], [], color=colour, linewidth=1.8)
+            (now,) = axes.plot([], [], "o", color=colour, markersize=6)
+            self.curves.append((self._artist(axes, curve), self._artist(axes, now)))
+
+    def images(self) -> Iterator[np.ndarray]:
+        """RGB pictures of the scene; the last one stays for a moment."""
+        canvas: Any = self.figure.canvas
+        canvas.draw()
+        still = canvas.copy_from_bbox(self.figure.bbox)
+        streams = [_scaled(take.pictures) for take in self.takes]
+        for k in range(self.length):
+            self._turn_to(k, streams)
+            canvas.restore_region(still)
+            for axes, artist in self.moving:
+                (axes or self.figure).draw_artist(artist)
+            picture = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+            yield picture
+        yield from itertools.repeat(picture, round(_HOLD * self.fps))
+
+    def _turn_to(self, k: int, streams: list[Iterator[np.ndarray]]) -> None:
+        """Give every artist what it shows in picture k; a take that is over stays as it ended."""
+        self.clock.set_text(f"{k / self.fps:.1f} s")
+        for take, stream, (axes, image, said) in zip(self.takes, streams, self.views, strict=True):
+            if k < len(take.said):
+                image.set_data(next(stream))
+                text, kind = take.said[k]
+                said.set(text=text, color=_KINDS[kind])
+                said.get_bbox_patch().set_edgecolor(_KINDS[kind])
+        main = self.takes[-1]
+        last = min(k, len(main.said) - 1)
+        if main.seen is not None:
+            self.seen.set_data(main.seen[last])
+        if self.plane is not None:
+            self._move(k, self.plane)
+            for level in self.levels:
+                level.turn_to(main.states[last])
+        for take, curve in zip(self.takes, self.curves, strict=False):
+            end = min(k, len(take.said) - 1)
+            if take.values is not None:
+                curve[0].set_data(np.arange(end + 1) / self.fps, take.values[: end + 1])
+                curve[1].set_data([end / self.fps], take.values[end : end + 1])
+
+    def _move(self, k: int, plane: Plane) -> None:
+        for take, (track, arrow, dot) in zip(self.takes, self.tracks, strict=True):
+            points = take.states[: k + 1][:, list(plane.coords)]
+            track.set_data(*plane.unwrap_breaks(points).T)
+            dot.set_data(points[-1:, 0], points[-1:, 1])
+            if self.headings:
+                heading = take.states[min(k, len(take.said) - 1), 2]
+                arrow.set_offsets(points[-1:])
+                arrow.set_UVC([math.cos(heading)], [math.sin(heading)])
+
+
+class _Level:
+    """The zero level of values on a grid, at the present value of a third coordinate."""
+
+    def __init__(self, plane: Plane, states: Any, name: str, values: Any) -> None:
+        self.colour, self.style = (BARRIER_COLOUR, "-") if name == "B" else (KERNEL_COLOUR, "--")
+        self.lines: Any = None
+        self.period = plane.period[2] if plane.dim == 3 else 0.0
+        self.third = np.unique(array("states", states, (None, plane.dim))[:, 2]) if plane.dim == 3 else np.zeros(1)
+        self.tables = []
+        for value in self.third:
+            cut = dataclasses.replace(plane, fixed={2: float(value)}) if plane.dim == 3 else plane
+            self.x, self.y, table = cut.grid(states, {"v": values})
+            self.tables.append(table["v"])
+
+    def collection(self) -> Any:
+        """The line, still empty."""
+        lines = require("matplotlib.collections").LineCollection
+        return lines([], colors=self.colour, linewidths=1.5, linestyles=self.style, zorder=2)
+
+    def turn_to(self, state: np.ndarray) -> None:
+        """Move the line to the third coordinate of a state."""
+        table = self.tables[0]
+        if len(self.third) > 1:
+            at = float(state[2])
+            if self.period:
+                at = self.third[0] + (at - self.third[0]) % self.period
+            k = int(np.searchsorted(self.third, at, side="right")) - 1
+            following = self.third[k + 1] if k + 1 < len(self.third) else self.third[0] + self.period
+            share = (at - self.third[k]) / max(following - self.third[k], 1e-9)
+            table = self.tables[k] + min(share, 1.0) * (self.tables[(k + 1) % len(self.tables)] - self.tables[k])
+        contours = require("contourpy").contour_generator(self.x, self.y, table.astype(float))
+        self.lines.set_segments(contours.lines(0.5 if table.dtype == bool else 0.0))
+
+
+def _checked(take: Take, plane: Plane | None) -> Take:
+    """The take with arrays, of one length."""
+    n = len(take.said)
+    if n < 1:
+        raise ShapeError(f"take '{take.name}': expected at least one picture, received none.")
+    if plane is not None and take.states is None:
+        raise ShapeError(f"take '{take.name}': expected states ({n}, {plane.dim}) for the plane, received none.")
+    states = None if take.states is None else array("states", take.states, (n, None if plane is None else plane.dim))
+    values = None if take.values is None else array("values", take.values, (n,))
+    seen = None if take.seen is None else array("seen", take.seen, (n, None, None, 3)).astype(np.uint8)
+    return dataclasses.replace(take, states=states, values=values, seen=seen)
+
+
+def _scaled(pictures: Iterable[Any]) -> Iterator[np.ndarray]:
+    """Pictures enlarged by a whole number, as large as they are shown or larger."""
+    for picture in pictures:
+        picture = np.asarray(picture, np.uint8)
+        times = max(1, -(-VIEW // max(picture.shape[:2])))
+        yield picture.repeat(times, 0).repeat(times, 1) if times > 1 else picture
+
+
+def _with_poster(images: Iterator[np.ndarray], path: Path, fps: int) -> Iterator[np.ndarray]:
+    """The images; the one after two seconds, or the last, is kept in a file."""
+    poster: np.ndarray | None = None
+    for k, image in enumerate(images):
+        poster = image if k <= 2 * fps else poster
+        yield image
+    if poster is not None:
+        require("PIL.Image").fromarray(poster).save(path, quality=88)
 
 
 def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
@@ -139,6 +333,13 @@ def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
 
 
 def _write_gif(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
+    """One palette for all, so that what stays the same costs nothing."""
     pillow = require("PIL.Image")
-    pages = [pillow.fromarray(image).quantize(64) for image in images]
-    pages[0].save(path, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0, optimize=True)
+    shown = [pillow.fromarray(image) for image in images]
+    some = np.concatenate([np.asarray(image) for image in shown[:: max(1, len(shown) // 8)]])
+    # Half for what is seen most, half for colours that are rare and far apart.
+    parts = [pillow.fromarray(some).quantize(_COLOURS // 2, method=m) for m in (pillow.Quantize.MEDIANCUT, pillow.Quantize.MAXCOVERAGE)]
+    palette = pillow.new("P", (1, 1))
+    palette.putpalette([c for part in parts for c in (part.getpalette() or [])[: 3 * (_COLOURS // 2)]])
+    pages = [image.quantize(palette=palette, dither=0) for image in shown]
+    pages[0].save(path, save_all=True, append_images=pages[1:], duration=round(1000 / fps), loop=0, optimize=False)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 #: Fill colours of the sets, as in the paper: light green for S, light red for U.
 SAFE_FILL, UNSAFE_FILL, OUTSIDE_FILL = "#cdeccd", "#fadcd7", "#e3e5e8"
+OBSTACLE_FILL = "#b3261e"
 #: Colours and markers of points: they differ in shape too, for readers who do not tell red from green.
 POINTS: dict[int, tuple[str, str, str]] = {
     0: ("#6b7280", "s", "buffer"),
@@ -78,6 +79,7 @@ class Plane:
         safe_set, unsafe_set: S and U, filled light green and light red; None: not drawn.
         coords: which two coordinates of the state are shown.
         fixed: values of the other coordinates at which S and U are drawn; default: the middle of their range.
+        obstacle: what stands there, a set of the two coordinates shown; None: nothing.
 
     Raises ConfigError for other coordinates or ranges. Source: paper Section V, figure "plot_real_pend"; deviation:
     none.
@@ -95,6 +97,7 @@ class Plane:
     unsafe_set: Region | None = None
     coords: tuple[int, int] = (0, 1)
     fixed: dict[int, float] = field(default_factory=dict)
+    obstacle: Region | None = None
 
     def __post_init__(self) -> None:
         self.low, self.high = [float(v) for v in self.low], [float(v) for v in self.high]
@@ -115,7 +118,7 @@ class Plane:
         cls, env: Any, names: tuple[str, str] = ("x0", "x1"), *, coords: tuple[int, int] = (0, 1),
         fixed: dict[int, float] | None = None,
     ) -> Plane:  # fmt: skip
-        """Plane of an environment's ``state_space`` (a box, or a box with holes), ``safe_set`` and ``unsafe_set``.
+        """Plane of an environment's ``state_space`` (a box, or a box with holes), ``safe_set``, ``unsafe_set`` and ``obstacle``.
 
         The other arguments are those of the class. Raises ConfigError if the state space is no box. Source: none.
         """
@@ -128,7 +131,8 @@ class Plane:
                 "build the Plane from low and high."
             )
         corners = space.low.tolist(), space.high.tolist(), space.period.tolist()
-        return cls(names, *corners, env.safe_set, env.unsafe_set, coords, dict(fixed or {}))
+        obstacle = getattr(env, "obstacle", None) if coords == (0, 1) else None
+        return cls(names, *corners, env.safe_set, env.unsafe_set, coords, dict(fixed or {}), obstacle)
 
     @property
     def dim(self) -> int:
@@ -164,6 +168,8 @@ class Plane:
         for region, colour in ((self.unsafe_set, UNSAFE_FILL), (self.safe_set, SAFE_FILL)):
             if region is not None:
                 image[region.contains(state).numpy()] = to_rgb(colour)
+        if self.obstacle is not None:
+            image[self.obstacle.contains(state[:, [i, j]]).numpy()] = to_rgb(OBSTACLE_FILL)
         shown = state[:, [i, j]].numpy()
         image[((shown < corners[0]) | (shown > corners[1])).any(1)] = to_rgb(OUTSIDE_FILL)
         units = [name.partition("[")[2] for name in self.names[:2]]

@@ -199,12 +199,19 @@ def file_uri(path: str | Path) -> str:
     return _data_uri(path.read_bytes(), mime)
 
 
-def _shown(uri: str, alt: str, caption: str) -> str:
-    """A picture or film with its caption, which is HTML already."""
+def _shown(uri: str, alt: str, caption: str, poster: str = "") -> str:
+    """A picture or film with its caption, which is HTML already; ``poster``: what is shown before the film begins."""
     media = f'<img alt="{escape(alt)}" src="{uri}">'
     if uri.startswith("data:video/"):
-        media = f'<video controls loop muted playsinline preload="metadata" src="{uri}"></video>'
+        shown = f' poster="{poster}"' if poster else ""
+        media = f'<video controls loop muted playsinline preload="metadata"{shown} src="{uri}"></video>'
     return f"<figure>{media}<figcaption>{caption}</figcaption></figure>"
+
+
+def _film(path: Path, caption: str) -> str:
+    """A film; a picture beside it of the same name, ending in .jpg, is shown before it begins."""
+    poster = path.with_suffix(".jpg")
+    return _shown(file_uri(path), caption, escape(caption), file_uri(poster) if poster.is_file() else "")
 
 
 def _figure(name: str, value: Any) -> str:
@@ -297,7 +304,8 @@ def write_report(
         config: everything that determined the run, nested; its ``seed`` is named at the top.
         checks: held-out checks, one mapping or dataclass per round.
         certificate: section made by :func:`~torchrl_sspl.viz.certificate.certificate_section`.
-        video, video_caption: mp4, webm or gif file, and what it shows.
+        video, video_caption: mp4, webm or gif file, and what it shows; a picture beside it, of the same name with the ending .jpg, is
+            shown before it begins.
         notes: text, in paragraphs separated by empty lines.
         headline: verdict and its kind ("good", "fair", "bad" or "none") where there is no summary.
         measured: what was measured, as sentences, where there is no summary.
@@ -320,10 +328,10 @@ def write_report(
     shown = _measured_lines(summary, data) or measured
     parts = [
         _verdict(first, kind, proved, shown, _ASSUMED if assumed is None else assumed),
+        _section("Film", "" if video is None else _film(Path(video), video_caption)),
         _section("Requirements", rows_of_summary),
         certificate or "",
         _section("Notes", _paragraphs(notes)),
-        _section("Episode", "" if video is None else _shown(file_uri(video), video_caption, escape(video_caption))),
         _section("Figures", "".join(_figure(n, f) for n, f in (figures or {}).items())),
         _section("Held-out checks of every round", _sizes(checks) if checks else ""),
         _measurements(data) if data else "",

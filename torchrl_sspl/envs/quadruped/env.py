@@ -12,7 +12,9 @@ from numpy.typing import NDArray
 
 from torchrl_sspl.envs.base import check_positive
 from torchrl_sspl.envs.quadruped.camera import TopCamera
+from torchrl_sspl.envs.quadruped.controller import Measurement
 from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
+from torchrl_sspl.envs.quadruped.stage import Stage
 from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 
@@ -90,6 +92,7 @@ class QuadrupedEnv(gymnasium.Env):
         self.arena_half_size = arena_half_size
         self.safe_half_size, self.unsafe_half_size = safe_half_size, unsafe_half_size
         self.obstacle_shape, self.obstacle_centre = obstacle_shape, np.asarray(obstacle_centre, dtype=np.float64)
+        self.obstacle_half_size = obstacle_half_size
         self.render_mode = render_mode
         self._client = connect(gui=render_mode == "human")
         self._robot = WalkingRobot(self._client, meshes=meshes)
@@ -100,6 +103,9 @@ class QuadrupedEnv(gymnasium.Env):
         self._large = TopCamera(self._client, _RENDER_SIZE)
         self._substeps = max(1, round(dt / self._robot.dt))
         self._frames: NDArray[np.uint8] | None = None
+        #: The robot after every time step of the physics (``physics_dt``, in s) in the last step, for films.
+        self.motion: list[Measurement] = []
+        self.physics_dt = self._robot.dt
         # The simulator remembers contacts: every episode starts from one and the same memory.
         self._robot.place(self._gait[0], 0.0, -self.safe_half_size, 0.0)
         self._walk(0.0)
@@ -153,6 +159,16 @@ class QuadrupedEnv(gymnasium.Env):
         """The top view, uint8 ``(512, 512, 3)``, in render mode "rgb_array"; a window follows by itself."""
         return self._large.capture() if self.render_mode == "rgb_array" else None
 
+    def stage(self, size: int, colours: dict[str, tuple[int, int, int]]) -> Stage:
+        """A second world for pictures of ``motion``, ``size`` pixels high and wide; colours of "S", "U" and the "buffer"."""
+        centre = self.obstacle_centre.tolist()
+        areas = [
+            (self.arena_half_size, (0.0, 0.0), colours["S"]), (self.safe_half_size, centre, colours["buffer"]),
+            (self.unsafe_half_size, centre, colours["U"]),
+        ]  # fmt: skip
+        shape, half = self.obstacle_shape, self.obstacle_half_size
+        return Stage(size, obstacle_shape=shape, obstacle_half_size=half, obstacle_centre=centre, areas=areas)
+
     def close(self) -> None:
         """End the simulation; may be called more than once."""
         if self._client is not None:
@@ -161,9 +177,10 @@ class QuadrupedEnv(gymnasium.Env):
 
     def _walk(self, rate: float) -> bool:
         """Simulate one step at a yaw rate; whether the obstacle was touched."""
-        contact = False
+        contact, self.motion = False, []
         for _ in range(self._substeps):
             self._robot.step([self.speed, 0.0, rate])
+            self.motion.append(self._robot.measured)
             contact = contact or bool(self._client.getContactPoints(self._robot.body_id, self._obstacle))
         return contact
 
