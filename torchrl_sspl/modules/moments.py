@@ -10,6 +10,7 @@ from torchrl_sspl.errors import ConfigError, EmptyRegionError
 from torchrl_sspl.modules.networks import FrameEncoder, mlp
 
 _NOISE = 0.05  # difference in [-1, 1] that is not seen
+_VAGUE = 0.1  # scaled third moment below which a thing has no front
 
 
 class ColourMoments(nn.Module):
@@ -211,19 +212,19 @@ class ShapeMoments(nn.Module):
 class ShapeEncoder(MomentEncoder):
     r"""Frame encoder on moments, for a scene in which one thing of one colour, with a front and a back, moves.
 
-    .. math:: z_t = \tanh(a (c_t, \tfrac{m_{t-1} + m_t}{2}) + \operatorname{MLP}(h_{t-1}, h_t, k (c_t - c_{t-1})))
-        \in (-1, 1)^p
+    .. math:: h_t = \Big(c_t, \frac{m_{t-1} + m_t}{\|m_{t-1} + m_t\|}\Big), \qquad
+        z_t = \tanh(a \, h_t + \operatorname{MLP}(h_t)) \in (-1, 1)^p
 
-    with h the moments of :class:`ShapeMoments`, c the centre and m the third moment among them. Before the training
-    :meth:`fit` takes the statistics from frames; no label and no state enters. Sizes that are not valid are a
-    ConfigError. Source: paper eq. (7); the paper does not give an architecture.
+    with the centre c and the third moment m of :class:`ShapeMoments`. The motion between two frames is not looked at: it
+    tells the direction less exactly than the shape. Before the training :meth:`fit` takes the statistics from
+    frames; no label and no state enters. Sizes that are not valid are a ConfigError. Source: paper eq. (7); the paper
+    does not give an architecture.
 
     Args:
         latent_dim: size p of the latent, at least four.
         image_size: height and width of the frames in pixels; ``None`` accepts any size.
         pool_to: height and width after average pooling.
         hidden: width of the MLP.
-        velocity_gain: gain k of the difference of the two frames' centres.
 
     Example:
         >>> ShapeEncoder(latent_dim=4, image_size=128)(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
@@ -231,24 +232,19 @@ class ShapeEncoder(MomentEncoder):
     """
 
     def __init__(
-        self,
-        latent_dim: int,
-        image_size: int | None = None,
-        *,
-        pool_to: int = 64,
-        hidden: int = 64,
-        velocity_gain: float = 12.0,
+        self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, hidden: int = 64
     ) -> None:
         if latent_dim < 4:
             raise ConfigError(f"expected latent_dim >= 4 for place and direction, received {latent_dim}")
-        super().__init__(latent_dim, image_size, pool_to=pool_to, hidden=hidden, velocity_gain=velocity_gain)
+        super().__init__(latent_dim, image_size, pool_to=pool_to, hidden=hidden)
+        del self.arguments["velocity_gain"]
         self.features = 6
         self.trunk = nn.Sequential(ShapeMoments(pool_to, self.in_channels))
-        self.latent_head = mlp((14, hidden, hidden, latent_dim), nn.SiLU)
+        self.latent_head = mlp((4, hidden, latent_dim), nn.SiLU)
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
         """Latent from the moments of two successive frames; see :meth:`FrameEncoder.head`."""
-        motion = self.velocity_gain * (current[..., :2] - previous[..., :2])
-        shaped = self.latent_head(torch.cat([previous, current, motion], -1))
-        direct = torch.cat([current[..., :2], (previous[..., 4:] + current[..., 4:]) / 2], -1)
-        return torch.tanh(self.gain * F.pad(direct, (0, self.latent_dim - 4)) + shaped)
+        ahead = previous[..., 4:] + current[..., 4:]
+        ahead = ahead / (ahead.square().sum(-1, keepdim=True) + _VAGUE**2).sqrt()
+        seen = torch.cat([current[..., :2], ahead], -1)
+        return torch.tanh(self.gain * F.pad(seen, (0, self.latent_dim - 4)) + self.latent_head(seen))
