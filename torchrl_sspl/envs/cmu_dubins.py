@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
+import gymnasium
 import torch
 from torch import Tensor
 
@@ -133,7 +133,7 @@ class CMUDubinsEnv(DubinsEnv):
         """The car itself: its true kernel is computed."""
         return self
 
-    def physics(self) -> Callable[[], Any] | None:
+    def physics(self) -> Callable[[], gymnasium.Env] | None:
         """None: the benchmark has no other physics."""
         return None
 
