@@ -153,7 +153,7 @@ def main() -> None:
             assert value is not None
             found[label] = scores(value <= 0, kernel.contains(states))
             print(row(f"{name}, {label}", found[label]), flush=True)
-        found["training"] = agent.description.get("training", {})
+        found["training ended"] = agent.description.get("stop_reason", "")
     for name, found in body["agents"].items():
         agent = sspl.load(name)
         found["in the loop"] = in_the_loop(agent, env, kernel, given.episodes) if given.episodes else {}
