@@ -139,7 +139,7 @@ def test_what_is_malformed_is_named_and_leaves_nothing(word, said, capsys, tmp_p
 
 def test_no_system_is_named(capsys):
     assert cli.main(["train", "seed=1"]) == 2
-    assert "choose env=dubins|gymnasium|pendulum|quadruped" in capsys.readouterr().err
+    assert "choose env=cmu|dubins|gymnasium|pendulum|quadruped" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

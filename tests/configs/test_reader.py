@@ -357,7 +357,7 @@ def test_a_factory_can_be_sent_to_another_process():
 
 
 def test_a_factory_without_a_system_names_the_choices():
-    with pytest.raises(ConfigError, match="choose env=dubins"):
+    with pytest.raises(ConfigError, match="choose env=cmu"):
         EnvFactory(compose().env)
 
 

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import copy
+import math
+
 import pytest
 import torch
+from torch import nn
 
+from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
-from torchrl_sspl.errors import DTypeError, EmptyRegionError
-from torchrl_sspl.modules import LatentDynamics, MomentEncoder, Policy
+from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError
+from torchrl_sspl.modules import LatentDynamics, MomentEncoder, Policy, ShapeEncoder
 from torchrl_sspl.modules.agent import Agent, mlp_barrier
 
 
@@ -79,3 +84,53 @@ def test_wrong_frames_are_named(seen):
 def test_an_empty_frame_is_finite(seen):
     encoder, _, _ = seen
     assert torch.isfinite(encoder(torch.full((1, 6, 64, 64), 255, dtype=torch.uint8))).all()
+
+
+@pytest.fixture(scope="module")
+def arrows():
+    """Encoder of shapes fitted to 300 frames of arrows, and 200 fresh states away from the border with their frames."""
+    env = CMUDubinsEnv()
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    encoder = ShapeEncoder(4, 128)
+    encoder.fit(env.draw(env.sample_states(300, generator)))
+    states = env.sample_states(200, generator) * torch.tensor([0.8, 0.8, 1.0])
+    return encoder, states, env.observe(states)
+
+
+def test_an_arrow_of_one_colour_tells_place_and_heading_to_two_degrees(arrows):
+    encoder, states, pixels = arrows
+    with torch.no_grad():
+        moments = encoder.frames(pixels.unflatten(1, (2, 3)))
+    found = moments[:, :, 2:4].sum(1)
+    angle = torch.remainder(torch.atan2(-found[:, 1], found[:, 0]) - states[:, 2] + math.pi, 2 * math.pi) - math.pi
+    assert angle.square().mean().sqrt() < math.radians(2.5)
+    ahead = torch.stack([states[:, 2].cos(), states[:, 2].sin()], -1)
+    centre = moments[:, 1, :2] * encoder.trunk[0].scale[:2] * 1.1 * torch.tensor([1.0, -1.0])
+    assert (centre - states[:, :2] - 0.05 * ahead).norm(dim=-1).mean() < 0.01  # m; a pixel has 0.017 m
+
+
+def test_the_shape_is_the_same_before_every_background(arrows):
+    encoder, states, pixels = arrows
+    frames, moments = pixels[:, 3:].float() / 127.5 - 1.0, encoder.trunk[0]
+    plain = copy.deepcopy(moments)
+    plain.background.fill_(1.0)  # the picture is white but for the disc's outline
+    bare = CMUDubinsEnv(obstacle_colour=(1.0, 1.0, 1.0)).draw(states).float() / 127.5 - 1.0
+    half = nn.functional.avg_pool2d
+    assert (moments.moments(half(frames, 2)) - plain.moments(half(bare, 2)))[:, :2].abs().max() < 0.01
+
+
+def test_noise_of_a_camera_moves_the_shape_little(arrows):
+    encoder, _, pixels = arrows
+    noisy = (pixels.float() + torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1))).round().clamp(0, 255).byte()
+    with torch.no_grad():
+        assert (encoder(noisy) - encoder(pixels)).abs().max() < 0.02
+
+
+def test_an_encoder_of_shapes_needs_four_latents_and_survives_disk(arrows, tmp_path):
+    with pytest.raises(ConfigError, match="latent_dim >= 4"):
+        ShapeEncoder(3)
+    encoder, _, pixels = arrows
+    twin = ShapeEncoder(**encoder.arguments)
+    twin.load_state_dict(encoder.state_dict())
+    assert torch.equal(twin(pixels[:9]), encoder(pixels[:9]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.envs.pendulum import PendulumEnv as PendulumEnv  # not in __all__: TorchRL has one too
@@ -11,6 +12,6 @@ from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
 from torchrl_sspl.envs.system import Opening, Requirement, System
 
 __all__ = [
-    "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "Opening", "PendulumRenderer", "PixelPendulumEnv", "Requirement",
-    "SafetyEnv", "System",
+    "CMUDubinsEnv", "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "Opening", "PendulumRenderer", "PixelPendulumEnv",
+    "Requirement", "SafetyEnv", "System",
 ]  # fmt: skip

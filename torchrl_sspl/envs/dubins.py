@@ -260,7 +260,7 @@ class DubinsEnv(SafetyEnv):
             return self
         return DubinsEnv(self.batch_size, horizon=self.horizon, device=self.device, seed=0, **self._geometry())
 
-    def physics(self) -> Callable[[], gymnasium.Env]:
+    def physics(self) -> Callable[[], gymnasium.Env] | None:
         """Maker of the walking robot (paper, Section IV-B) with the same obstacle, regions, speed and actions.
 
         Raises MissingDependencyError without the simulator.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from torchrl_sspl.modules.moments import MomentEncoder
+from torchrl_sspl.modules.moments import MomentEncoder, ShapeEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
 from torchrl_sspl.modules.observer import LatentObserver, Predict
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
@@ -16,6 +16,7 @@ __all__ = [
     "Policy",
     "Predict",
     "SaLaD",
+    "ShapeEncoder",
     "as_tensordict_module",
     "inward_clamp",
     "make_rollout_policy",

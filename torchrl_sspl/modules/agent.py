@@ -24,7 +24,7 @@ from torchrl_sspl.files import write
 from torchrl_sspl.lipschitz import prove_lipschitz
 from torchrl_sspl.modules.controller import Controller
 from torchrl_sspl.modules.export import export
-from torchrl_sspl.modules.moments import MomentEncoder
+from torchrl_sspl.modules.moments import MomentEncoder, ShapeEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
 from torchrl_sspl.modules.observer import gain_matrix
 
@@ -44,7 +44,9 @@ def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
 
 
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
-ENCODERS: dict[str, type[nn.Module]] = {"FrameEncoder": FrameEncoder, "MomentEncoder": MomentEncoder}
+ENCODERS: dict[str, type[nn.Module]] = {
+    "FrameEncoder": FrameEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder,
+}  # fmt: skip
 DYNAMICS: dict[str, type[nn.Module]] = {"LatentDynamics": LatentDynamics}
 POLICIES: dict[str, type[nn.Module]] = {"Policy": Policy}
 

@@ -6,8 +6,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_sspl.errors import EmptyRegionError
-from torchrl_sspl.modules.networks import FrameEncoder
+from torchrl_sspl.errors import ConfigError, EmptyRegionError
+from torchrl_sspl.modules.networks import FrameEncoder, mlp
+
+_NOISE = 0.05  # difference in [-1, 1] that is not seen
+_VAGUE = 0.03  # scaled length below which a direction is none
+_WHOLE = 0.9  # of the usual covered share, from which a thing is seen as a whole
 
 
 class ColourMoments(nn.Module):
@@ -135,3 +139,120 @@ class MomentEncoder(FrameEncoder):
         motion = self.velocity_gain * (current - previous)
         shaped = self.latent_head(torch.cat([current, motion], -1))
         return torch.tanh(self.gain * current + shaped)
+
+
+class ShapeMoments(nn.Module):
+    r"""Place and shape of what differs from the background: centre, third moment and size of the covered share.
+
+    .. math:: w = \max_k |f_k - b_k|, \qquad d = (x, y) - c, \qquad
+        h = \Big(\langle (x, y) \rangle, \;\langle |d|^2 d \rangle, \;\textstyle\sum w\Big) / \sigma
+
+    with averages over w. The third moment points along whatever has one end that is heavier than the other, such as an arrow
+    of one colour. The largest difference over the colours counts, so that a thing covers the same share before every
+    background. Background b and usual size are medians; they and the other scales :math:`\sigma` come from frames alone and are set by :meth:`fit`.
+    Source: none.
+
+    Args:
+        size: height and width of the (pooled) frames.
+        channels: colours.
+
+    Example:
+        >>> frames = torch.ones(50, 3, 16, 16)
+        >>> places = torch.randint(16, (50, 2), generator=torch.Generator().manual_seed(0))
+        >>> frames[torch.arange(50), :, places[:, 0], places[:, 1]] = 0.0  # one dark pixel each
+        >>> moments = ShapeMoments(16)
+        >>> moments.fit(frames)
+        >>> moments(frames).shape
+        torch.Size([50, 5])
+    """
+
+    background: Tensor
+    scale: Tensor
+    axis: Tensor
+
+    def __init__(self, size: int, channels: int = 3) -> None:
+        super().__init__()
+        self.register_buffer("background", torch.ones(channels, size, size))
+        self.register_buffer("scale", torch.ones(5))
+        self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
+
+    def moments(self, frames: Tensor) -> Tensor:
+        """Moments ``(n, 5)``, not scaled, of frames ``(n, c, H, W)`` in [-1, 1]; x to the right, y down."""
+        # What a camera's noise changes is not a thing.
+        weight = ((frames - self.background).abs().amax(1) - _NOISE).clamp_min(0.0)
+        columns, rows = weight.sum(-2), weight.sum(-1)
+        mass = rows.sum(-1, keepdim=True).clamp_min(1e-3 * self.axis.numel())  # less than that is nothing: the middle
+        x, y = columns @ self.axis[:, None] / mass, rows @ self.axis[:, None] / mass
+        right, down = self.axis - x, self.axis - y
+
+        def mean(of_rows: Tensor, of_columns: Tensor) -> Tensor:
+            return ((weight @ of_columns[..., None])[..., 0] * of_rows).sum(-1, keepdim=True) / mass
+
+        third_x = (columns * right**3).sum(-1, keepdim=True) / mass + mean(down**2, right)
+        third_y = (rows * down**3).sum(-1, keepdim=True) / mass + mean(down, right**2)
+        return torch.cat([x, y, third_x, third_y, rows.sum(-1, keepdim=True)], -1)
+
+    @torch.no_grad()
+    def fit(self, frames: Tensor) -> None:
+        """Take background and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
+        if len(frames) < 10:
+            raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
+        self.background.copy_(frames[:2000].median(0).values)
+        found = torch.cat([self.moments(part) for part in frames.split(32)])
+        # One scale for both directions: turning the frame turns what is seen.
+        pairs = found[:, :4].unflatten(-1, (2, 2)).square().mean((0, 2)).sqrt()
+        self.scale.copy_(torch.cat([pairs.repeat_interleave(2), found[:, 4:].median(0).values]).clamp_min(1e-8))
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Scaled moments ``(n, 5)`` of frames ``(n, c, H, W)``."""
+        parts = [frames] if torch.compiler.is_exporting() else frames.split(32)
+        return torch.cat([self.moments(part) for part in parts]) / self.scale
+
+
+class ShapeEncoder(MomentEncoder):
+    r"""Frame encoder on moments, for a scene in which one thing of one colour, with a front and a back, moves.
+
+    .. math:: a_t = s^4 (m_{t-1} + m_t) / 2 + (1 - s^4) k (c_t - c_{t-1}), \qquad
+        h_t = (c_t, a_t / \|a_t\|), \qquad z_t = \tanh(g \, h_t + \operatorname{MLP}(h_t)) \in (-1, 1)^p
+
+    with centre c and third moment m of :class:`ShapeMoments`, and s in [0, 1] the share of the thing that is seen in both
+    frames. The shape tells the direction more exactly than the motion from one frame to the next, unless the border of the
+    frame cuts it. Before the training :meth:`fit` takes the statistics from frames; no label and no state enters. Sizes
+    that are not valid are a ConfigError. Source: paper eq. (7); the paper does not give an architecture.
+
+    Args:
+        latent_dim: size p of the latent, at least four.
+        image_size: height and width of the frames in pixels; ``None`` accepts any size.
+        pool_to: height and width after average pooling.
+        hidden: width of the MLP.
+        velocity_gain: gain k of the difference of the two frames' centres.
+
+    Example:
+        >>> ShapeEncoder(latent_dim=4, image_size=128)(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
+        torch.Size([2, 4])
+    """
+
+    def __init__(
+        self,
+        latent_dim: int,
+        image_size: int | None = None,
+        *,
+        pool_to: int = 64,
+        hidden: int = 64,
+        velocity_gain: float = 12.0,
+    ) -> None:
+        if latent_dim < 4:
+            raise ConfigError(f"expected latent_dim >= 4 for place and direction, received {latent_dim}")
+        super().__init__(latent_dim, image_size, pool_to=pool_to, hidden=hidden, velocity_gain=velocity_gain)
+        self.features = 5
+        self.trunk = nn.Sequential(ShapeMoments(pool_to, self.in_channels))
+        self.latent_head = mlp((4, hidden, latent_dim), nn.SiLU)
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the moments of two successive frames; see :meth:`FrameEncoder.head`."""
+        whole = (torch.minimum(previous, current)[..., 4:] / _WHOLE).clamp(0.0, 1.0) ** 4
+        shape, motion = (previous + current)[..., 2:4] / 2, (current - previous)[..., :2]
+        ahead = whole * shape + (1 - whole) * self.velocity_gain * motion
+        ahead = ahead / (ahead.square().sum(-1, keepdim=True) + _VAGUE**2).sqrt()
+        seen = torch.cat([current[..., :2], ahead], -1)
+        return torch.tanh(self.gain * F.pad(seen, (0, self.latent_dim - 4)) + self.latent_head(seen))
