@@ -22,6 +22,11 @@ def test_a_signal_ends_with_its_code_and_one_line(capsys, number, code):
     assert capsys.readouterr().err == f"\ninterrupted by {signal.Signals(number).name}; all is in a.pt\n"
 
 
+def test_a_program_that_catches_keyboard_interrupt_catches_it():
+    with pytest.raises(KeyboardInterrupt), interruptible():
+        signal.raise_signal(signal.SIGINT)
+
+
 def test_it_waits_for_the_state_to_be_saved_and_not_longer():
     done = []
 

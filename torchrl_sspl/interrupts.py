@@ -15,10 +15,10 @@ PATIENCE = 15.0
 """Seconds after a signal in which the next point where the state can be saved has to come."""
 
 
-class Interrupted(SystemExit):
+class Interrupted(SystemExit, KeyboardInterrupt):
     """What a signal has ended; the process exits with 128 and the number of the signal, without a traceback.
 
-    Source: none.
+    A program that catches KeyboardInterrupt catches it. Source: none.
 
     Example:
         >>> Interrupted(15).code
