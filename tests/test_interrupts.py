@@ -14,6 +14,22 @@ from torchrl_sspl import interrupts
 from torchrl_sspl.interrupts import Interrupted, end_if_pending, interruptible, pending, saving
 
 
+@pytest.fixture(autouse=True)
+def _python_takes_the_signals():
+    """Whatever the tests were started by: in the background of a shell SIGINT is ignored."""
+    before = [signal.signal(n, h) for n, h in ((signal.SIGINT, signal.default_int_handler), (signal.SIGTERM, signal.SIG_DFL))]
+    yield
+    for number, handler in zip((signal.SIGINT, signal.SIGTERM), before, strict=True):
+        signal.signal(number, handler)
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interruptible():
+        signal.raise_signal(signal.SIGINT)
+        assert not pending()
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_with_its_code_and_one_line(capsys, number, code):
     with pytest.raises(Interrupted) as ended, interruptible(lambda: "all is in a.pt"):

@@ -62,7 +62,7 @@ def test_from_the_simulator_to_the_report(name, example, tmp_path, monkeypatch):
     assert measured["random_touch_unsafe"]["n"] == measured["starts_inside"]["n"] == 6
     page = outcome.report.read_text()
     assert "Tiny" in page
-    assert "data:image/gif" in page
+    assert "data:video/mp4" in page
     assert "exact arithmetic on the deployed weights" in page
     assert "What the weights prove" in page
     assert "What fresh episodes show" in page

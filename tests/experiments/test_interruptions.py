@@ -29,7 +29,10 @@ def start(system: str, out: Path) -> subprocess.Popen[str]:
     words = [*SYSTEMS[system], "trainer.checkpoint_seconds=0.5", f"out_dir={out}"]
     command = [sys.executable, "-W", "ignore", "-m", "torchrl_sspl", "train", *words]
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
-    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
+    return subprocess.Popen(
+        command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background of a shell it is ignored
+    )  # fmt: skip
 
 
 @pytest.fixture(scope="module", params=SYSTEMS)

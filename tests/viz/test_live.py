@@ -161,14 +161,20 @@ def test_whoever_is_slow_receives_the_newest_steps_only():
 
 def test_an_interrupt_ends_it_and_the_film_can_be_seen(tmp_path):
     words = ["watch", "pendulum", "--port", "0", "--record", str(tmp_path / "a.mp4")]
-    process = subprocess.Popen([sys.executable, "-m", "torchrl_sspl", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "torchrl_sspl", *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background of a shell it is ignored
+    )  # fmt: skip
     assert process.stdout is not None
     address = process.stdout.readline().split()[0]
     with urlopen(f"{address}events") as stream:
         for _ in range(6):
             stream.readline()
     process.send_signal(signal.SIGINT)
-    told, errors = process.communicate(timeout=60)
+    try:
+        told, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
     assert (process.returncode, errors) == (0, "")
     found = re.search(r"steps (\d+)", told)
     assert found is not None
