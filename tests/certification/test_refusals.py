@@ -373,12 +373,12 @@ def test_missing_certificate_and_broken_weights_have_exit_codes(issued, tmp_path
 
 
 def test_every_reason_has_a_twin():
-    """Reasons of networks are in test_deployed, those of files in test_forgeries."""
+    """Reasons of networks are in test_deployed and test_choices, those of files in test_forgeries."""
     here = {r for _, r in [*DETERMINISTIC.values(), *STATISTICAL.values(), *FILES.values()]}
     paper = {Reason.CONDITION_FAILS, Reason.NOT_MEASURED, Reason.NOT_FINITE}
     files = {r for _, r in [*test_forgeries.FORGED.values(), *test_forgeries.AGENTS.values()]}
     files |= {Reason.DIGEST_CHANGED, Reason.SCHEMA_UNKNOWN}  # with tests of their own
-    text = (Path(__file__).parent / "test_deployed.py").read_text() + (Path(__file__).parent / "test_float32.py").read_text()
+    text = "".join((Path(__file__).parent / f"test_{name}.py").read_text() for name in ("deployed", "float32", "choices"))
     deployed = {r for r in Reason if f'"{r.name}"' in text or f"Reason.{r.name}" in text}
     deployed |= {Reason.PREMISE_NOT_MET, Reason.NOTHING_TOLERATED}  # of the run-time layer, with tests of their own
     assert set(Reason) == here | paper | files | deployed | {Reason.VACUITY_UNDECIDED}

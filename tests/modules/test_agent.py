@@ -230,6 +230,14 @@ def test_an_agent_of_networks_in_training_is_a_copy_and_changes_nothing(barrier)
         assert torch.equal(value, kept[name]), name
 
 
+def test_networks_in_training_stay_on_their_device(monkeypatch):
+    nets, moved, cpu = networks(), [], nn.Module.cpu
+    monkeypatch.setattr(nn.Module, "cpu", lambda net: moved.append(net) or cpu(net))
+    Agent.from_networks(*nets)
+    assert len(moved) == 4
+    assert not any(net is other for net in nets for other in moved)
+
+
 @pytest.mark.parametrize("barrier", [SandwichBarrier, LMIBarrier])
 def test_its_level_becomes_zero_and_its_bound_is_proved(barrier):
     nets = networks(barrier)

@@ -12,7 +12,7 @@ from torch import nn
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError
-from torchrl_sspl.modules import LatentDynamics, MomentEncoder, Policy, ShapeEncoder
+from torchrl_sspl.modules import BearingEncoder, LatentDynamics, MomentEncoder, Policy, ShapeEncoder
 from torchrl_sspl.modules.agent import Agent, mlp_barrier
 
 
@@ -134,3 +134,82 @@ def test_an_encoder_of_shapes_needs_four_latents_and_survives_disk(arrows, tmp_p
     twin = ShapeEncoder(**encoder.arguments)
     twin.load_state_dict(encoder.state_dict())
     assert torch.equal(twin(pixels[:9]), encoder(pixels[:9]))
+
+
+@pytest.fixture(scope="module")
+def bearings():
+    """Encoder of bearings fitted to 500 frames of a robot past an obstacle that is not in the middle, and fresh states outside U."""
+    env = DubinsEnv(obstacle_centre=(0.4, -0.3), image_size=128)
+    generator = torch.Generator().manual_seed(0)
+    encoder = BearingEncoder(3, 128)
+    encoder.fit(env.draw(env.sample_states(500, generator)))
+    states = env.sample_states(400, generator, region=env.state_space - env.unsafe_set)
+    states = states[states[:, :2].abs().amax(1) < 1.9]
+    return env, encoder, states
+
+
+def test_a_bearing_is_the_obstacle_in_the_robots_frame_to_a_few_centimetres(bearings):
+    env, encoder, states = bearings
+    seen = torch.atanh(encoder(env.observe(states))[:, :2]) * 0.625 * 1.2 * env.arena_half_size  # m
+    away = torch.tensor(env.obstacle_centre) - states[:, :2]
+    c, s = states[:, 2].cos(), states[:, 2].sin()
+    truth = torch.stack([c * away[:, 0] + s * away[:, 1], -(c * away[:, 1] - s * away[:, 0])], -1)  # aside is to the right in a picture
+    forward = (seen * truth).sum() > 0  # which end is which, the colours do not say
+    off = (seen - (truth if forward else -truth)).norm(dim=-1)
+    assert off.square().mean().sqrt() < 0.05  # m; a pixel has 0.038 m
+    assert (off / truth.norm(dim=-1)).max() < 0.1
+
+
+def test_a_bearing_does_not_change_when_robot_and_obstacle_turn_together(bearings):
+    _, encoder, _ = bearings
+    bearing = encoder.trunk[0]
+    centres, turn = torch.randn(20, 2, 3), torch.linalg.qr(torch.randn(2, 2)).Q
+    turn = turn * torch.stack([turn.det(), torch.tensor(1.0)])  # a rotation
+    moved = copy.deepcopy(bearing)
+    moved.anchor.copy_(turn @ bearing.anchor)
+    bearing.centres, moved.centres = (lambda c: c), (lambda c: turn @ c)
+    try:
+        assert torch.allclose(moved(centres), bearing(centres), atol=1e-5)
+    finally:
+        del bearing.centres
+
+
+def test_entries_that_no_picture_shows_are_zero_and_the_encoder_survives_disk(bearings):
+    env, encoder, states = bearings
+    pixels = env.observe(states[:9])
+    assert encoder(pixels)[:, 2].eq(0.0).all()
+    twin = BearingEncoder(**encoder.arguments)
+    twin.load_state_dict(encoder.state_dict())
+    assert torch.equal(twin(pixels), encoder(pixels))
+    assert not [p for p in encoder.parameters() if p.requires_grad]
+    with pytest.raises(ConfigError, match="latent_dim >= 2"):
+        BearingEncoder(1)
+
+
+def test_an_empty_frame_has_a_finite_bearing(bearings):
+    _, encoder, _ = bearings
+    assert torch.isfinite(encoder(torch.full((1, 6, 128, 128), 255, dtype=torch.uint8))).all()
+
+
+def _noise(pixels):
+    drawn = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(1))
+    return (pixels.float() + 12.0 * drawn).round().clamp(0, 255).byte()
+
+
+@pytest.mark.parametrize(
+    ("change", "most"),
+    [
+        (_noise, 0.05),
+        (lambda p: (0.85 * p.float()).round().byte(), 0.05),
+        (lambda p: (1.15 * p.float()).round().clamp(0, 255).byte(), 0.05),
+        (lambda p: p.roll(1, -1), 0.07),
+        (lambda p: p.roll(-1, -2), 0.07),
+    ],
+    ids=["noise of 12/255", "darker", "brighter", "camera a pixel aside", "camera a pixel higher"],
+)
+def test_harmless_changes_of_the_picture_move_a_bearing_by_centimetres(bearings, change, most):
+    env, encoder, states = bearings
+    near = (states[:, :2] - torch.tensor(env.obstacle_centre)).norm(dim=-1) < 1.6
+    pixels = env.observe(states[near])
+    place = [torch.atanh(encoder(p)[:, :2]) * 0.625 * 1.2 * env.arena_half_size for p in (pixels, change(pixels))]
+    assert (place[1] - place[0]).square().sum(-1).mean().sqrt() < most  # m

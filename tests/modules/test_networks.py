@@ -122,6 +122,18 @@ def test_dynamics_is_the_clamped_residual_of_its_net() -> None:
     assert (expected.abs() == 1).any()
 
 
+def test_dynamics_that_remember_hand_the_action_on() -> None:
+    dynamics = LatentDynamics(3, 1, action_scale=2.0, remembers=True)
+    latent, action = torch.rand(5, 3) - 0.5, torch.tensor([[-2.0], [-1.0], [0.0], [1.0], [4.0]])
+    after = dynamics(latent, action)
+    assert after[:, 2].tolist() == [-1.0, -0.5, 0.0, 0.5, 1.0]
+    assert torch.allclose(after[:, :2], (latent[:, :2] + dynamics.net(torch.cat([latent, action / 2.0], -1))).clamp(-1, 1))
+    assert (dynamics(latent * torch.tensor([1.0, 1.0, -1.0]), action)[:, :2] != after[:, :2]).any()  # what was done before counts
+    assert LatentDynamics(**dynamics.arguments).moving_dim == 2
+    with pytest.raises(ConfigError, match="latent_dim > action_dim"):
+        LatentDynamics(1, 1, remembers=True)
+
+
 def test_policy_is_the_scaled_clamp_of_its_net() -> None:
     torch.manual_seed(0)
     policy = Policy(2, 2, action_scale=[10.0, 0.5])

@@ -17,10 +17,10 @@ from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import AgentController
 from torchrl_sspl.evaluation.simulation import simulate
-from torchrl_sspl.modules import FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
+from torchrl_sspl.modules import BearingEncoder, FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
 from torchrl_sspl.modules.agent import Agent, load, mlp_barrier
 from torchrl_sspl.modules.controller import Memory, meets_premise, premise_met
-from torchrl_sspl.modules.observer import corrected, filtered, gain_matrix, held
+from torchrl_sspl.modules.observer import completed, corrected, filtered, gain_matrix, held
 
 
 def small_agent(gain: float | Tensor = 0.2, error: float = 0.05) -> Agent:
@@ -202,7 +202,7 @@ def test_the_same_corrections_are_cut_in_a_collector_and_in_a_controller():
     memory = Memory(agent)
     memory.correct(prior)
     memory.expect(prior)
-    latent, _, cut = memory.correct(seen)
+    latent, _, cut, _ = memory.correct(seen)
     assert bool(cut.any())
     begins = torch.zeros(64, 1, dtype=torch.bool)
     found = observer(TensorDict(pixels=frames(64, 1), prior=prior, is_init=begins, batch_size=[64]))
@@ -297,3 +297,40 @@ def test_an_agent_with_a_gain_that_is_none_cannot_be_read(tmp_path):
     save_file(weights | {"gain": 3.0 * torch.eye(3)}, path / "agent.safetensors")
     with pytest.raises(CheckpointError, match="gain"):
         Agent.load(path)
+
+
+def test_what_no_picture_shows_is_what_was_expected():
+    gain = gain_matrix(0.25, 3, 2)
+    assert gain.diag().tolist() == [0.25, 0.25, 0.0]
+    prior, seen = torch.tensor([[0.0, 0.0, 0.7]]), torch.tensor([[0.4, -0.4, 0.0]])
+    whole = completed(seen, prior, gain)
+    assert whole.tolist() == [[pytest.approx(0.4), pytest.approx(-0.4), pytest.approx(0.7)]]
+    latent, innovation = corrected(prior, whole, gain)
+    assert torch.allclose(latent, torch.tensor([[0.1, -0.1, 0.7]]))
+    assert innovation[0, 2] == 0.0
+
+
+def test_a_memory_keeps_the_last_action_and_judges_pictures_with_it():
+    encoder = BearingEncoder(3, 32, pool_to=16)
+    dynamics = LatentDynamics(3, 1, (8,), 2.0, remembers=True)
+    inside_where_it_turned = nn.Sequential(nn.Linear(3, 1))
+    nn.utils.vector_to_parameters(torch.tensor([0.0, 0.0, -1.0, 0.4]), inside_where_it_turned.parameters())
+    policy = Policy(3, 1, (4,), 2.0)
+    agent = Agent(encoder, dynamics, inside_where_it_turned, policy, 1.0, {"tolerated_error": 0.1}, gain_matrix(0.3, 3, 2))
+    controller, pixels = agent.controller(1), torch.zeros(1, 6, 32, 32, dtype=torch.uint8)
+    assert float(controller.step(pixels).latent[0, 2]) == 0.0
+    controller.took(torch.tensor([[1.5]]))
+    step = controller.step(pixels)
+    assert float(step.latent[0, 2]) == float(step.seen[0, 2]) == 0.75
+    assert float(step.barrier) == pytest.approx(-0.35)
+
+
+def test_a_picture_of_u_is_judged_with_whatever_the_memory_may_hold():
+    barrier = nn.Sequential(nn.Linear(3, 1))  # below zero where it turned right by more than half
+    nn.utils.vector_to_parameters(torch.tensor([0.0, 0.0, 1.0, 0.5]), barrier.parameters())
+    nets = BearingEncoder(3, 32, pool_to=16), LatentDynamics(3, 1, (8,), 2.0, remembers=True), barrier, Policy(3, 1, (4,), 2.0)
+    agent, seen = Agent(*nets, 1.0, gain=gain_matrix(0.3, 3, 2)), torch.zeros(4, 3)
+    assert agent.barrier(seen)[:, 0].tolist() == [0.5] * 4
+    assert agent.least_barrier(seen).tolist() == [-0.5] * 4
+    shows_all = Agent(*nets, 1.0, gain=0.3)
+    assert torch.equal(shows_all.least_barrier(seen), shows_all.barrier(seen)[:, 0])

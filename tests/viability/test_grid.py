@@ -184,6 +184,18 @@ def test_the_strong_pendulum_recovers_from_everywhere_and_the_weak_one_does_not(
     assert target.value.gt(0).float().mean() < share < 0.9
 
 
+def test_a_kernel_under_errors_is_smaller_by_what_they_cost():
+    """x' = 1.5 x + u + e with |u| <= 0.1 and |e| <= 0.05 is kept up to |x| = 0.1, half of what is kept without errors."""
+    line = {"low": [-1.2], "high": [1.2], "resolution": 481, "margin": lambda x: 1 - x[:, 0].abs()}
+    line["actions"] = torch.linspace(-0.1, 0.1, 5)[:, None]
+    kernel = viability_kernel(lambda x, u: 1.5 * x + u, errors=torch.tensor([[-0.05], [0.0], [0.05]]), **line)
+    assert kernel.contains(torch.tensor([[0.09], [-0.09], [0.11], [-0.11]])).tolist() == [True, True, False, False]
+    none = viability_kernel(lambda x, u: 1.5 * x + u, errors=torch.zeros(1, 1), **line)
+    assert torch.equal(none.value, viability_kernel(lambda x, u: 1.5 * x + u, **line).value)
+    with pytest.raises(ShapeError, match=r"errors: expected shape \(j, 1\)"):
+        viability_kernel(lambda x, u: 1.5 * x + u, errors=torch.zeros(3), **line)
+
+
 def test_missing_and_bad_arguments_are_named():
     def still(x, u):
         return x

@@ -54,7 +54,7 @@ class Problem:
     low: Tensor  # corners of the domain, (p,)
     high: Tensor
     function: Graph  # F, (n, p) -> (n, q)
-    rows: Tensor  # R, (K, q); nonnegative where ``inner`` is given
+    rows: Tensor  # R, (K, q); nonnegative where there is ``inner``
     barrier: Graph  # B, (n, p) -> (n, 1)
     barrier_weight: Tensor  # b, (K,), nonnegative
     constant: Tensor  # c, (K,)
@@ -62,8 +62,8 @@ class Problem:
     floor: float | None = None  # c_-
     combine: str = "min"  # or "max", of the rows
     lipschitz: float | None = None  # proved Lipschitz constant of B
-    inner: int | None = None  # step of F that holds d(z, pi(z)) where F ends with B
-    error: float = 0.0  # Euclidean norm up to which anything may be added to that step, as long as it stays in the domain
+    inner: tuple[int, ...] = ()  # steps of F, one for each output, that hold d(z, u) where this output is B of it
+    error: float = 0.0  # Euclidean norm up to which anything may be added to the only one of these, as long as it stays in the domain
 
     @property
     def constrained(self) -> bool:
@@ -73,8 +73,8 @@ class Problem:
     def evaluate(self, point: Tensor) -> tuple[Tensor, Tensor]:
         """Objective and barrier at points ``(n, p)``, each ``(n,)``."""
         barrier = self.barrier(point)
-        if self.error and self.inner is not None:
-            after = self.function.values(point)[self.inner]
+        if self.error and self.inner:
+            after = self.function.values(point)[self.inner[0]]
             with torch.enable_grad():
                 at = after.detach().requires_grad_()
                 (slope,) = torch.autograd.grad(self.barrier(at).sum(), at)
@@ -243,13 +243,14 @@ def _bound(
         for c in constraints:
             low, high = clip(low, high, c)
 
-    ball = None if q.inner is None or not q.error else (q.inner, q.error)
-    inner = Enclosure(q.function, low, high, until=q.inner, tight=tight, ball=ball)
+    ball = (q.inner[0], q.error) if q.inner and q.error else None
+    inner = Enclosure(q.function, low, high, until=max(q.inner, default=None), tight=tight, ball=ball)
     first = torch.full((len(low), len(q.rows)), math.inf, dtype=low.dtype)
-    if q.inner is not None and q.lipschitz is not None:
-        least, most = inner.interval(q.inner)
-        reach = q.lipschitz * ((0.5 * (most - least)).norm(dim=1) + q.error)
-        first = (q.barrier(0.5 * (least + most)) + reach[:, None]) @ q.rows.mT + q.constant
+    if q.inner and q.lipschitz is not None:
+        least, most = (torch.stack(ends, 1) for ends in zip(*(inner.interval(k) for k in q.inner), strict=True))
+        reach = q.lipschitz * ((0.5 * (most - least)).norm(dim=2) + q.error)
+        middle = q.barrier(0.5 * (least + most).flatten(0, 1)).reshape(reach.shape)
+        first = (middle + reach) @ q.rows.mT + q.constant
         if below is not None and bool(q.barrier_weight.any()):
             first = first + q.barrier_weight * below.at(inner.center).upper(inner.radius)
         keep = ~(q.combined(first) <= limit)
@@ -273,7 +274,7 @@ def _bound(
         for k in range(len(q.rows)):
             row = LinearBound(-above.slope[:, k : k + 1], limit - above.value[:, k : k + 1], above.center)
             low, high = clip(low, high, row)
-    last = len(q.function.steps) - 1 if q.inner is None else q.inner
+    last = q.inner[0] if q.inner else len(q.function.steps) - 1
     sensitivity = inner.slope(last)[keep].norm(dim=2) if last in q.function.interfaces else above.slope.abs().amax(1)
     sensitivity = sensitivity + 0.1 * sensitivity.amax(1, keepdim=True) + 1e-9
     return low, high, upper, sensitivity, kept

@@ -43,6 +43,7 @@ class Reason(StrEnum):
     OVERRIDDEN = "a method of a network is overridden, replaced or compiled"
     SUBCLASSED = "a module is a subclass of a known one and may compute something else"
     PARAMETRIZED = "a weight is computed, not stored"
+    CHOOSES_BY_OTHERS = "the policy chooses by another barrier or other dynamics than those that are proved"
     SCALE_INVALID = "an action scale is not positive and finite, one number per action"
     WRONG_DTYPE = "the networks are not all float32, or all float64"
     VALUES_DIFFER = "a deployed network computes other values than the one that is proved"

@@ -1,14 +1,15 @@
 r"""The conditions of a barrier certificate, decided for frozen networks on the whole latent domain.
 
 All are about the closed loop :math:`z^+ = d(z, \pi(z))` on a box that the encoder cannot leave. Each is proved, refuted
-with a counterexample, or undecided with what remains.
+with a counterexample, or undecided with what remains. Of a policy that chooses, what it would do is bounded for each action
+beside what it accepts (Theorem H in ``docs/theory.md``).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import torch
@@ -23,6 +24,9 @@ from torchrl_sspl.lipschitz.layers import FORMS, Activation, clamp
 from torchrl_sspl.lipschitz.network import check_module, flat_layers
 
 _SCALES = (1e-10, 1e10)
+#: How often more it counts by how much a policy that chooses accepts its own action than by how much the set is kept: any number
+#: is sound; the larger it is, the less is lost near the border of acceptance.
+_SHARPNESS = 16.0
 
 
 @dataclass(frozen=True)
@@ -31,39 +35,77 @@ class ClosedLoop:
 
     Attributes:
         barrier: B, ``(n, p) -> (n, 1)``.
-        step: :math:`d(z, \pi(z))`, ``(n, p) -> (n, p)``.
-        looped: :math:`B(d(z, \pi(z)))`, ``(n, p) -> (n, 1)``.
-        inner: number of the step of ``looped`` that holds :math:`d(z, \pi(z))`.
+        step: :math:`d(z, \pi(z))`, ``(n, p) -> (n, p)``; of a policy that chooses, for its own action and each of the table,
+            ``(n, (1 + K) p)``.
+        looped: :math:`B(d(z, \pi(z)))`, ``(n, p) -> (n, 1)``; of a policy that chooses ``(n, 1 + K)``.
+        inner: numbers of the steps of ``looped`` that hold :math:`d(z, \pi(z))`, one for each output.
         lipschitz_bound: proved Lipschitz constant of B.
         low: lower corner of the domain, ``(p,)`` float64.
         high: upper corner, ``(p,)`` float64.
+        accepted: :math:`-m` of a policy that chooses: what B may be after its own action; :math:`-\infty` of any other.
     """
 
     barrier: Graph
     step: Graph
     looped: Graph
-    inner: int
+    inner: tuple[int, ...]
     lipschitz_bound: float
     low: Tensor
     high: Tensor
+    accepted: float = -math.inf
 
     @property
     def latent_dim(self) -> int:
         """Size of the latent."""
         return self.barrier.input_dim
 
+    @property
+    def chooses(self) -> bool:
+        """Whether the policy chooses."""
+        return len(self.inner) > 1
+
     def problem(
-        self, *, level: float | None, weight: tuple[float, ...] = (0.0,), constant: tuple[float, ...] = (0.0,), error: float = 0.0
+        self,
+        *,
+        level: float | None,
+        weight: tuple[float, ...] = (0.0,),
+        constant: tuple[float, ...] = (0.0,),
+        error: float = 0.0,
+        lost: float = 0.0,
     ) -> Problem:
-        r"""Maximum of :math:`\min_k B(d(z, \pi(z)) + e) - b_k B(z) + c_k` where B is at most a level, if one is given, over
-        all e up to an error that stay in the domain."""
-        b, c = (torch.tensor(v, dtype=torch.float64) for v in (weight, constant))
-        rows = torch.ones(len(weight), 1, dtype=torch.float64)
+        r"""Maximum of :math:`\min_k B(d(z, \pi(z)) + e) - b_k B(z) + c_k + \lambda` where B is at most a level, if one is given,
+        over all e up to an error that stay in the domain; :math:`\lambda` is what an evaluation of :math:`B(d(z, \pi(z)))` may be off.
+
+        Of a policy that chooses, with sharpness :math:`\sigma`, it is what is left where its own action is not accepted:
+
+        .. math:: \min \{ \sigma (B(d(z, \pi(z))) + m + \lambda), \; \min_k B(d(z, a_k)) + c + 3 \lambda + L_B \delta \}
+
+        If this is at most zero, or a number below, then so is the second part wherever the first is above zero. Which of the
+        table is chosen is decided without the error, so that the error counts by the Lipschitz constant.
+        """
         # An infinite constant would turn the cheap tests into comparisons with infinity and NaN.
         known = self.lipschitz_bound if math.isfinite(self.lipschitz_bound) else None
-        domain = self.low, self.high
+        if self.chooses:
+            if any(weight) or len(weight) > 1:
+                raise ConfigError("expected the condition R3 of a policy that chooses, received one that weighs B(z); see decide_invariance")
+            n = len(self.inner)
+            kept = constant[0] + 3.0 * lost + self.lost_by(error)
+            constant = (_SHARPNESS * (lost - self.accepted), *[kept] * (n - 1))
+            rows, weight, error = torch.diag(torch.tensor([_SHARPNESS] + [1.0] * (n - 1), dtype=torch.float64)), (0.0,) * n, 0.0
+        else:
+            rows, constant = torch.ones(len(weight), 1, dtype=torch.float64), tuple(c + lost for c in constant)
+        b, c = (torch.tensor(v, dtype=torch.float64) for v in (weight, constant))
         of: dict[str, Any] = {"level": level, "lipschitz": known, "inner": self.inner, "error": error}
-        return Problem(*domain, self.looped, rows, self.barrier, b, c, **of)
+        return Problem(self.low, self.high, self.looped, rows, self.barrier, b, c, **of)
+
+    def lost_by(self, error: float) -> float:
+        """What B may rise by with an error, latent units, by the Lipschitz constant; barrier units, rounded up."""
+        return _above(self.lipschitz_bound * error) if error else 0.0
+
+    def rounding(self, unit: float, *, boxes: int = 8192) -> tuple[float, float]:
+        """What an evaluation with a unit roundoff is off at most, anywhere: of B, and of d(z, pi(z)) (Euclidean norm)."""
+        step = largest_rounding(self.step, self.low, self.high, unit, boxes=boxes, vectors=len(self.inner))
+        return largest_rounding(self.barrier, self.low, self.high, unit, boxes=boxes), step
 
 
 def closed_loop(
@@ -89,7 +131,8 @@ def closed_loop(
         dynamics: module in the form above (``modules.LatentDynamics``), or a plain ``nn.Sequential`` of ``(z, u)``,
             p + m inputs and p outputs, taken as it is. Either takes the action in physical units.
         policy: module in the form above (``modules.Policy``), or a plain ``nn.Sequential``, p inputs and m outputs.
-            Either gives the action in physical units.
+            Either gives the action in physical units. Or a ``modules.ChoosingPolicy`` of such a policy, bound to this barrier and
+            to these dynamics, which are of the form above.
         latent_dim: p.
         lipschitz_bound: proved Lipschitz constant of the barrier (``math.inf`` where none is known).
         low: lower corner of the domain, a number or ``(p,)``.
@@ -115,20 +158,55 @@ def closed_loop(
         raise ConfigError(f"expected finite low < high in every dimension, received {corners[0].tolist()}, {corners[1].tolist()}")
     if not lipschitz_bound > 0:
         raise ConfigError(f"expected a positive Lipschitz bound of the barrier, received {lipschitz_bound}")
-    def append_step(graph: Graph) -> int:
-        return _append_dynamics(graph, dynamics, *_append_policy(graph, policy))
-
+    chooses = FORMS.get(type(policy)) == "choosing"
+    if chooses:
+        _check_choice(policy, dynamics, barrier, corners)
     alone, step, looped = Graph(latent_dim), Graph(latent_dim), Graph(latent_dim)
     alone.network(0, barrier)
-    append_step(step)
-    inner = append_step(looped)
-    looped.network(inner, barrier)
-    if alone.output_dim != 1 or step.output_dim != latent_dim:
+    found, inner = (_append_steps(graph, dynamics, policy) for graph in (step, looped))
+    sizes = {step.sizes[k] for k in found}
+    if alone.output_dim != 1 or sizes != {latent_dim}:
         raise ConfigError(
-            f"expected a barrier of one output and dynamics of {latent_dim}, received {alone.output_dim} "
-            f"and {step.output_dim}"
+            f"expected a barrier of one output and dynamics of {latent_dim}, received {alone.output_dim} and {sorted(sizes)}"
         )
-    return ClosedLoop(alone, step, looped, inner, float(lipschitz_bound), *corners)
+    step.side_by_side(found)
+    looped.side_by_side([looped.network(k, barrier) for k in inner])
+    accepted = -float(cast(Tensor, policy.margin)) if chooses else -math.inf
+    return ClosedLoop(alone, step, looped, tuple(inner), float(lipschitz_bound), corners[0], corners[1], accepted)
+
+
+def _check_choice(policy: nn.Module, dynamics: nn.Module, barrier: nn.Module, corners: Sequence[Tensor]) -> None:
+    """Refuses a policy that chooses by something else than what is proved, or in another way."""
+    check_module(policy)
+    loop = vars(policy).get("loop")
+    if type(loop) is not tuple or len(loop) != 2 or loop[0] is not dynamics or loop[1] is not barrier:
+        raise StructureError(
+            "expected a policy that chooses by the dynamics and the barrier that are proved, received one that is "
+            f"{'not bound' if loop is None else 'bound to others'}; bind(dynamics, barrier), which an Agent does by itself",
+            "CHOOSES_BY_OTHERS",
+        )
+    parts = [policy._buffers.get(name) for name in ("actions", "margin")]
+    if any(t is None for t in parts) or cast(Tensor, parts[0]).ndim != 2 or cast(Tensor, parts[1]).ndim:
+        raise StructureError("expected a policy that chooses from a table of actions (K, m) with one margin, buffers both")
+    if FORMS.get(type(dynamics)) != "residual" or bool((corners[0] > -1.0).any() | (corners[1] < 1.0).any()):
+        raise StructureError(
+            "expected dynamics of the form 'residual' (modules.LatentDynamics) in a domain that holds [-1, 1]: a policy that chooses "
+            f"asks B of every successor, received {type(dynamics).__name__} and {corners[0].tolist()}, {corners[1].tolist()}"
+        )
+
+
+def _append_steps(graph: Graph, dynamics: nn.Module, policy: nn.Module) -> list[int]:
+    """Appends d(z, pi(z)), or what a policy that chooses compares: d(z, .) of its own action, then of those of its table."""
+    chooses = FORMS.get(type(policy)) == "choosing"
+    own, scale = _append_policy(graph, cast(nn.Module, policy.policy) if chooses else policy)
+    actions = [own]
+    for action in cast(Tensor, policy.actions).detach().double().cpu() if chooses else ():
+        if len(action) != graph.sizes[own]:
+            raise StructureError(f"expected a table of {graph.sizes[own]} entries per action, received {len(action)}")
+        # A step of its own: in the bias of the next one, terms that cancel would seem to round off nothing.
+        still = torch.zeros(len(action), graph.input_dim)
+        actions.append(graph.linear([0], [still], action if scale is None else action / scale))
+    return [_append_dynamics(graph, dynamics, action, scale) for action in actions]
 
 
 def _append_policy(graph: Graph, policy: nn.Module) -> tuple[int, Tensor | None]:
@@ -161,7 +239,13 @@ def _append_dynamics(graph: Graph, dynamics: nn.Module, action: int, scale: Tens
     if len(layers) == 1 or not isinstance(last, nn.Linear):
         raise StructureError("expected the dynamics' network to start and end with different linear layers")
     hidden = graph.layers(hidden, layers[1:-1])
-    moved = graph.linear([0, hidden], [torch.eye(p), last.weight], last.bias, roundings=1)
+    eye, rest = torch.eye(p), p - last.out_features
+    if getattr(dynamics, "remembers", False) and rest == m:  # the action of this step, divided by its scale
+        pads = [nn.functional.pad(t, (0, 0, 0, rest)) for t in (eye[:-rest], last.weight)]
+        bias = nn.functional.pad(last.bias, (0, rest)) if last.bias is not None else None
+        moved = graph.linear([0, hidden, action], [*pads, eye[:, -rest:]], bias, roundings=3)
+    else:
+        moved = graph.linear([0, hidden], [eye, last.weight], last.bias, roundings=1)
     return graph.interface(graph.apply(moved, clamp()))
 
 
@@ -215,7 +299,7 @@ def decide_invariance(
 
     Args:
         system: the closed loop.
-        condition: "R3", "R1" or "R2".
+        condition: "R3", "R1" or "R2"; of a policy that chooses R3 alone.
         level: s, barrier units.
         margin: m, barrier units.
         decay: :math:`\alpha \in [0, 1]` of R1.
@@ -226,10 +310,11 @@ def decide_invariance(
         progress: show a progress bar.
 
     Returns:
-        The outcome; ``upper`` bounds left side minus right side.
+        The outcome; ``upper`` bounds left side minus right side. Of a policy that accepts its own actions at more than
+        :math:`s - m` it is undecided at best.
 
     Raises:
-        ConfigError: if the condition is unknown or a parameter is out of range.
+        ConfigError: if the condition is unknown or not one for this policy, or a parameter is out of range.
 
     Source: paper eq. (5); deviation: on the set instead of everywhere, on the whole latent domain instead of samples.
 
@@ -252,8 +337,42 @@ def decide_invariance(
             f"expected 0 <= decay <= 1, decrement >= 0 and finite level, margin and floor, received decay={decay}, "
             f"decrement={decrement}, level={level}, margin={margin}, floor={floor}"
         )
-    problem = system.problem(level=level, **terms[condition])
-    return maximise(problem, threshold=0.0, budget=budget, confirm=confirm, progress=progress)
+    how: dict[str, Any] = {"threshold": 0.0, "budget": budget, "confirm": confirm, "progress": progress}
+    if condition == "R3":
+        return largest_next(system, level=level, constant=margin - level, **how)
+    return maximise(system.problem(level=level, **terms[condition]), **how)
+
+
+def largest_next(
+    system: ClosedLoop, *, level: float, constant: float, error: float = 0.0, lost: float = 0.0, threshold: float | None = None, **how: Any
+) -> Outcome:
+    r"""Largest :math:`B(d(z, \pi(z)) + e) + c` where B is at most a level, or a decision about it (:func:`.branch_and_bound.maximise`).
+
+    A policy that chooses accepts its own action wherever B is computed to be at most :math:`-m` after it; that counts, too, as
+    :math:`-m + c + 2 \lambda + L_B \delta`.
+
+    Args:
+        system: the closed loop.
+        level: s, barrier units.
+        constant: c.
+        error: :math:`\delta \ge \lVert e \rVert`, latent units.
+        lost: :math:`\lambda`, what an evaluation of :math:`B(d(z, \pi(z)))` may be off, barrier units.
+        threshold: value to prove.
+        **how: of ``maximise``.
+
+    Source: none.
+
+    Example:
+        >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
+        >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
+        >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+        >>> 0.25 <= largest_next(loop, level=0.5, constant=0.0).upper < 0.252
+        True
+    """
+    own = math.fsum((system.accepted, constant, 2.0 * lost, system.lost_by(error)))
+    found = maximise(system.problem(level=level, constant=(constant,), error=error, lost=lost), threshold=threshold, **how)
+    kept = found.status != "proved" or threshold is None or own <= threshold
+    return replace(found, status=found.status if kept else "undecided", upper=max(found.upper, own))
 
 
 @dataclass(frozen=True)
@@ -290,16 +409,21 @@ def largest_error(
     """
     if not math.isfinite(system.lipschitz_bound):
         raise ConfigError("expected a finite Lipschitz bound of the barrier, received infinity; prove one first")
-    problem = system.problem(level=level, constant=(-level,))
-    found = maximise(problem, tolerance=tolerance, budget=budget, progress=progress)
+    found = largest_next(system, level=level, constant=-level, tolerance=tolerance, budget=budget, progress=progress)
     # What decides, decides by more than the slack.
     proved = _below(-(found.upper + SLACK) / system.lipschitz_bound)
-    return LargestError(proved, (SLACK - found.lower) / system.lipschitz_bound, found)
+    most = max(found.lower, system.accepted - level)  # errors count by the Lipschitz constant where an action is accepted, too
+    return LargestError(proved, (SLACK - most) / system.lipschitz_bound, found)
 
 
 def _below(value: float) -> float:
     """Less than what the last operations, exactly carried out, would give."""
     return value - 4.0 * math.ulp(value)
+
+
+def _above(value: float) -> float:
+    """More than what the last operations, exactly carried out, would give."""
+    return value + 4.0 * math.ulp(value)
 
 
 def tolerates(
@@ -309,6 +433,7 @@ def tolerates(
     level: float = 0.0,
     barrier_rounding: float = 0.0,
     step_rounding: float = 0.0,
+    every_way: bool = True,
     budget: Budget | None = None,
 ) -> Outcome:
     r"""Decides whether :math:`\{B \le s\}` is kept whatever error of a size is added, by its own bounds in every direction.
@@ -317,13 +442,15 @@ def tolerates(
         B(d(z, \pi(z)) + e) + L_B \epsilon_d + \epsilon_B \le s
 
     :func:`largest_error` asks the same through the Lipschitz constant, as if the barrier rose by it everywhere and in every
-    direction at once.
+    direction at once. So does this of a policy that chooses, which does not know the error when it does; what is rounded off
+    counts more often then (Theorem H in ``docs/theory.md``).
 
     Args:
         system: the closed loop, with a finite Lipschitz bound.
         error: :math:`\delta`, latent units.
         level: s, barrier units.
         barrier_rounding, step_rounding: :math:`\epsilon_B` and :math:`\epsilon_d` of the computed networks.
+        every_way: whether errors count by bounds in every direction; False: by the Lipschitz constant.
         budget: when to give up.
 
     Source: none.
@@ -337,8 +464,10 @@ def tolerates(
     """
     lost = system.lipschitz_bound * step_rounding + barrier_rounding if step_rounding + barrier_rounding > 0 else 0.0
     inside = level + barrier_rounding + (SLACK if barrier_rounding else 0.0)
-    problem = system.problem(level=inside, constant=(lost - level,), error=error)
-    return maximise(problem, threshold=0.0, budget=budget)
+    constant = -level if every_way else system.lost_by(error) - level
+    return largest_next(
+        system, level=inside, constant=constant, error=error if every_way else 0.0, lost=lost, threshold=0.0, budget=budget
+    )
 
 
 @dataclass(frozen=True)
@@ -367,18 +496,27 @@ def computed_error(
 
     with :math:`\epsilon_B \ge |\hat B - B|` and :math:`\epsilon_d \ge \|\hat d(z, \hat\pi(z)) - d(z, \pi(z))\|` on the
     whole domain, bounded on so many boxes for this unit roundoff; ``known`` is the error in real arithmetic.
+
+    A policy that chooses does so by what is computed. With :math:`\lambda = \epsilon_B + L_B \epsilon_d` it is the largest
+    :math:`\delta` for which
+
+    .. math:: L_B \delta + 2 \lambda - m \le s, \qquad B(z) \le s + \epsilon_B, \; B(d(z, \pi(z))) > -m - \lambda \;\Rightarrow\;
+        \min_k B(d(z, a_k)) + 3 \lambda + L_B \delta \le s
+
+    as :math:`\lambda` is lost once where an action is accepted or not, twice where two of the table are compared, and once more
+    after the step (Theorem H in ``docs/theory.md``).
     """
     lipschitz = system.lipschitz_bound
-    of_barrier, of_step = (
-        largest_rounding(graph, system.low, system.high, unit, boxes=boxes) for graph in (system.barrier, system.step)
-    )
+    of_barrier, of_step = system.rounding(unit, boxes=boxes)
     if not math.isfinite(of_barrier + of_step):
         return ComputedError(-math.inf, of_barrier, of_step)
     lost = of_step + of_barrier / lipschitz
     delta = known.delta - lost  # what it could be at most
     if delta > 0.0:
-        problem = system.problem(level=level + of_barrier + SLACK, constant=(-level,))
-        found = maximise(problem, tolerance=tolerance, budget=budget)
+        how: dict[str, Any] = {"tolerance": tolerance, "budget": budget}
+        if system.chooses:  # what is lost decides which action is taken
+            how["lost"], lost = _above(lost * lipschitz), 0.0
+        found = largest_next(system, level=level + of_barrier + SLACK, constant=-level, **how)
         delta = -(found.upper + SLACK) / lipschitz - lost
     return ComputedError(_below(_below(delta)), of_barrier, of_step)
 
@@ -400,7 +538,7 @@ def decide_domain(system: ClosedLoop, *, budget: Budget | None = None) -> Outcom
         'refuted'
     """
     last = system.step.steps[-1]
-    if isinstance(last, Apply) and _within(last.activation, system):
+    if system.chooses or (isinstance(last, Apply) and _within(last.activation, system)):  # of those that choose it was demanded
         return Outcome("proved", 0.0, -math.inf, None, 0, 0.0, 0.0, 0)
     p = system.latent_dim
     eye, low, high = torch.eye(p, dtype=torch.float64), system.low, system.high
@@ -501,7 +639,8 @@ def evaluation_rounding(system: ClosedLoop, *, unit: float = 2.0**-53, per_axis:
     edges = [torch.linspace(float(a), float(b), per_axis + 1, dtype=torch.float64) for a, b in corners]
     ends = ([e[:-1] for e in edges], [e[1:] for e in edges])
     parts = zip(*(torch.cartesian_prod(*e).reshape(-1, system.latent_dim).split(512) for e in ends), strict=True)
-    return max(float(rounding_bound(system.looped, a, b, unit)[-1].max()) for a, b in parts)
+    factor = _SHARPNESS if system.chooses else 1.0
+    return factor * max(float(rounding_bound(system.looped, a, b, unit)[-1].max()) for a, b in parts)
 
 
 def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
@@ -509,13 +648,16 @@ def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
 
     .. math:: L_{cl} \le 1 + L_{net_d} \sqrt{1 + L_{net_\pi}^2}
 
-    Dynamics and policy are of the forms "residual" and "bounded" with one action scale, else ``StructureError``.
+    Dynamics and policy are of the forms "residual" and "bounded" with one action scale, else ``StructureError``; a policy that
+    chooses has none.
 
     Example:
         >>> from torchrl_sspl.modules import LatentDynamics, Policy
         >>> closed_loop_lipschitz(LatentDynamics(2, 1), Policy(2, 1)) > 1
         True
     """
+    if FORMS.get(type(policy)) == "choosing":
+        raise StructureError("expected a continuous policy, received one that chooses: its closed loop has no Lipschitz constant")
     moved, scale = _taken_apart(dynamics, "dynamics", "residual")
     control, own = _taken_apart(policy, "policy", "bounded")
     if scale is None or own is None or not torch.equal(scale, own):

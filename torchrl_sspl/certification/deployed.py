@@ -41,6 +41,7 @@ def check_deployed(
     """Compares the modules with the closed loop that was built from them, at random points, corners and the centre.
 
     The modules are those of :func:`~.conditions.closed_loop`, with the ``collapse()`` of a barrier that has one.
+    Of a policy that chooses each action's successor is compared, and which of them it takes.
     Returns the number of all points; ``StructureError`` if values differ by more than rounding allows, a module changes
     its input, or the dtypes are not one of float32 and float64.
 
@@ -60,14 +61,13 @@ def check_deployed(
     given: Tensor = point.to(device, dtype)
 
     def step(z: Tensor) -> Tensor:
-        u = policy(z)
-        return dynamics(torch.cat([z, u], -1)) if type(dynamics) is nn.Sequential else dynamics(z, u)
+        after = [dynamics(torch.cat([z, u], -1)) if type(dynamics) is nn.Sequential else dynamics(z, u) for u in _actions(system, policy, z)]
+        return torch.cat(after, -1) if system.chooses else after[0]
 
     for name, graph, function in (("barrier", system.barrier, barrier), ("d(z, pi(z))", system.step, step)):
         first, second = (rounding_bound(graph, point, point, unit, refined=True)[-1] for unit in (UNITS[dtype], 2.0**-53))
         exact = graph(point)
-        # In one batch, and some alone: the sums may be taken in another order, and nothing may remember the batch.
-        for rows in (slice(None), *(slice(k, k + 1) for k in range(0, len(point), max(1, len(point) // 8)))):
+        for rows in _batches(len(point)):
             z = given[rows].clone()
             try:
                 value = function(z)
@@ -86,7 +86,45 @@ def check_deployed(
                     f"{float(gap.max()):.3g}; deploy the networks that are certified",
                     "VALUES_DIFFER",
                 )
+    if system.chooses:
+        _check_choice(system, policy, point, given, UNITS[dtype])
     return len(point)
+
+
+def _batches(n: int) -> tuple[slice, ...]:
+    """All points in one batch, and some alone: the sums may be taken in another order, and nothing may remember the batch."""
+    return (slice(None), *(slice(k, k + 1) for k in range(0, n, max(1, n // 8))))
+
+
+def _actions(system: ClosedLoop, policy: nn.Module, z: Tensor) -> list[Tensor]:
+    """What the policy does at latents ``(n, p)``, or the actions among which it chooses, its own first; each ``(n, m)``."""
+    if not system.chooses:
+        return [policy(z)]
+    own: Tensor = policy.policy(z)  # type: ignore[operator]
+    return [own, *(action.expand_as(own) for action in policy.actions)]  # type: ignore[union-attr]
+
+
+def _check_choice(system: ClosedLoop, policy: nn.Module, point: Tensor, given: Tensor, unit: float) -> None:
+    """Refuses a policy that takes another action than it says, beyond what rounding decides."""
+    first, second = (rounding_bound(system.looped, point, point, u, refined=True)[-1] for u in (unit, 2.0**-53))
+    value, off = system.looped(point), first + second
+    low, high = value - off, value + off
+    may = low <= high[:, 1:].amin(1, keepdim=True)  # of the table: none is surely better
+    may &= high[:, :1] > system.accepted
+    may[:, 0] = low[:, 0] <= system.accepted
+    for rows in _batches(len(point)):
+        z = given[rows].clone()
+        try:
+            taken, tried = policy(z), torch.stack(_actions(system, policy, given[rows]), 1)
+        except (SSPLError, RuntimeError, ValueError, TypeError, IndexError) as error:
+            raise StructureError(f"expected the policy to be computable, received {error}", "VALUES_DIFFER") from error
+        same = taken.shape == tried[:, 0].shape and taken.dtype == tried.dtype and torch.equal(z, given[rows])
+        if not same or not bool((((taken[:, None] == tried).all(2)).cpu() & may[rows]).any(1).all()):
+            raise StructureError(
+                f"expected one of the policy's actions {tuple(tried[:, 0].shape)}: its own where B is at most {system.accepted:g} after it, "
+                "else the best of the table, received another; deploy the policy that is certified",
+                "VALUES_DIFFER",
+            )
 
 
 def _points(system: ClosedLoop, n: int, seed: int) -> Tensor:

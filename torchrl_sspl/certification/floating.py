@@ -73,10 +73,11 @@ def rounding_bound(
     return errors
 
 
-def largest_rounding(graph: Graph, low: Tensor, high: Tensor, unit: float, *, boxes: int = 8192) -> float:
+def largest_rounding(graph: Graph, low: Tensor, high: Tensor, unit: float, *, boxes: int = 8192, vectors: int = 1) -> float:
     """Bound of the Euclidean norm of the last step's rounding error anywhere on a domain; infinity where there is none.
 
-    The domain from ``low`` to ``high``, ``(p,)`` float64, is cut into about so many boxes, the worst ones first.
+    The domain from ``low`` to ``high``, ``(p,)`` float64, is cut into about so many boxes, the worst ones first. Of several vectors
+    of one size, which the step holds side by side, it is the largest norm.
 
     Example:
         >>> graph = Graph(2)
@@ -96,7 +97,8 @@ def largest_rounding(graph: Graph, low: Tensor, high: Tensor, unit: float, *, bo
         axis = (b - a).argmax(1, keepdim=True)
         middle = (0.5 * (a + b)).gather(1, axis)
         a, b = torch.cat([a, a.scatter(1, axis, middle)]), torch.cat([b.scatter(1, axis, middle), b])
-        error = rounding_bound(graph, a, b, unit, refined=True)[-1].norm(dim=1).nan_to_num(nan=torch.inf)
+        each = rounding_bound(graph, a, b, unit, refined=True)[-1].unflatten(1, (vectors, -1))
+        error = each.norm(dim=2).nan_to_num(nan=torch.inf).amax(1)
         least, most, bound = torch.cat([least[rest], a]), torch.cat([most[rest], b]), torch.cat([bound[rest], error])
         count += len(a)
     return float(bound.max()) * _SAFETY

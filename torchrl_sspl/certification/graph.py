@@ -83,6 +83,13 @@ class Graph:
             raise NonFiniteError("expected finite weights, received NaN or infinity; the network cannot be certified")
         return self._append(Affine(tuple(sources), matrices, offset, roundings), out, sources)
 
+    def side_by_side(self, sources: Sequence[int]) -> int:
+        """Appends the outputs of several steps as one vector, where there are several."""
+        if len(sources) == 1:
+            return sources[0]
+        sizes = [self.sizes[k] for k in sources]
+        return self.linear(sources, list(torch.eye(sum(sizes)).split(sizes, 1)))
+
     def apply(self, source: int, activation: Activation) -> int:
         """Appends an activation of an earlier step."""
         self.activated.add(source)

@@ -156,6 +156,8 @@ class _Proof:
             detail = f"counterexample z = {kept.witness.tolist()}"
         elif kept.status == "undecided":
             detail += f", {up(kept.remaining_volume, 2)} of the domain is left"
+            if system.accepted > self.level:
+                detail = f"the policy accepts its own action at B <= {system.accepted:g}, more than s; give it a larger margin"
         return self.state(
             "invariance",
             "B(z) <= s implies B(d(z, pi(z))) <= s, for every z of the domain",
@@ -186,7 +188,7 @@ class _Proof:
         short = name == "float32" and not self._enough(delta)
         self._error(name, text, delta, Reason.ROUNDING, detail + ("; deploy in float64" if short else ""))
 
-    def _in_every_way(self, system: ClosedLoop, delta: float, **rounding: float) -> bool:
+    def _in_every_way(self, system: ClosedLoop, delta: float, **rounding: Any) -> bool:
         """Whether the required error is tolerated although the Lipschitz constant gives a little less."""
         if not 0.0 < delta < self.required <= 2.0 * delta or not math.isfinite(sum(rounding.values())):
             return False

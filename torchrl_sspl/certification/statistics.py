@@ -311,7 +311,7 @@ def paper_numbers(
     return sizes, numbers | own | {"closed_loop_constant": closed_loop_constant}
 
 
-def paper_layer(record: Record, lipschitz_bound: float) -> Layer:
+def paper_layer(record: Record, lipschitz_bound: float, *, chooses: bool = False) -> Layer:
     r"""The paper's conditions on held-out samples, with its margins, and with those that its proof would need.
 
     .. math:: \psi = L_B \bar\epsilon, \; \eta = L_B \delta; \quad
@@ -321,6 +321,7 @@ def paper_layer(record: Record, lipschitz_bound: float) -> Layer:
     Args:
         record: with the entries of :func:`paper_numbers`.
         lipschitz_bound: :math:`L_B`.
+        chooses: whether the policy chooses, so that its closed loop has no Lipschitz constant.
 
     Source: paper eq. (3)-(5) and Theorem 1; deviations: q1, q2, q3 are asked where they make sense (S, U, the set), and
     :math:`\psi_3` is given in both forms.
@@ -337,13 +338,14 @@ def paper_layer(record: Record, lipschitz_bound: float) -> Layer:
     number = {k: math.nan if v is None else v for k, v in record.numbers.items()}
     psi, eta = lipschitz_bound * number["covering_radius"], lipschitz_bound * number["largest_error"]
     psi3 = psi * (number["closed_loop_constant"] + 1.0)
+    why = "no Lipschitz constant: the policy chooses" if chooses else ""
     for name, text, value in (
         ("safety margin", "psi* = L_B eps-bar, sampled", psi),
         ("dynamics margin", "eta* = L_B delta, sampled", eta),
         ("safety margin of q3", "psi* with the Lipschitz constant that the proof of q3 needs, L_B (L_cl + 1) eps-bar",
          psi3),
     ):  # fmt: skip
-        layer.state(REPORTED, name, text, value=value, unit="barrier")
+        layer.state(REPORTED, name, text, value=value, unit="barrier", detail=why if name == "safety margin of q3" else "")
     for name, text, kind, margin, met in (
         ("q1", "B + psi* <= 0 on held-out observations of S", "safe", psi, "safe_met"),
         ("q2", "-B + psi* <= 0 on held-out observations of U", "unsafe", psi, "unsafe_met"),
@@ -354,7 +356,8 @@ def paper_layer(record: Record, lipschitz_bound: float) -> Layer:
         n, worst = sizes[kind], number[f"{kind}_worst"] + margin
         if not n or not math.isfinite(worst):
             reason = Reason.NOT_FINITE if n else Reason.NOT_MEASURED
-            layer.state(MEASURED, name, text, False, reason, n=n)
+            detail = why if name == "q3 as its proof needs it" else ""
+            layer.state(MEASURED, name, text, False, reason, n=n, detail=detail)
             continue
         of = {"value": worst, "misses_by": None if worst <= 0 else worst, "unit": "barrier", "n": n}
         detail = f"holds on {100 * sizes[met] / n:.4g} % of the samples"

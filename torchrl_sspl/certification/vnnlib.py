@@ -11,6 +11,7 @@ from torch import Tensor
 from torchrl_sspl.certification.conditions import ClosedLoop
 from torchrl_sspl.certification.graph import Affine, Apply, Graph
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
+from torchrl_sspl.files import write
 
 NETWORK, PROPERTY = "invariance.onnx", "invariance.vnnlib"
 
@@ -20,16 +21,17 @@ def export_vnnlib(system: ClosedLoop, directory: str | Path, *, level: float = 0
 
     .. math:: \exists z \in [l, h]: \quad B(z) \le s, \quad B(d(z, \pi(z))) \ge s
 
-    ``unsat`` confirms [V]. The network gives :math:`(B(z), B(d(z, \pi(z))))` in matrix products, sums and ReLU alone: a clamp
-    is :math:`l + \operatorname{relu}(x - l) - \operatorname{relu}(x - h)`. Weights are float32, as deployed.
+    ``unsat`` confirms [V]. Of a policy that chooses it is a latent at which its own action is not accepted, and none of the table
+    keeps the set: :math:`B(d(z, \pi(z))) \ge -m` and :math:`B(d(z, a_k)) \ge s` for all k. The network gives B(z), then these
+    values, in matrix products, sums and ReLU alone: a clamp is :math:`l + \operatorname{relu}(x - l) - \operatorname{relu}(x - h)`. Weights are float32, as deployed.
 
     Args:
         system: piecewise linear networks, of :func:`closed_loop`.
         directory: where ``invariance.onnx`` and ``invariance.vnnlib`` are written.
         level: s.
 
-    Returns the paths of network and property. Raises ConfigError for an activation that is not piecewise linear, and
-    MissingDependencyError without the package ``onnx``. Source: none.
+    Returns the paths of network and property. Raises ConfigError for an activation that is not piecewise linear, or a policy that
+    accepts its own actions above this level, and MissingDependencyError without the package ``onnx``. Source: none.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -44,17 +46,18 @@ def export_vnnlib(system: ClosedLoop, directory: str | Path, *, level: float = 0
         import onnx
     except ImportError as error:
         raise MissingDependencyError("writing ONNX needs the package onnx: pip install onnx") from error
+    if system.accepted > level:
+        raise ConfigError(f"expected a policy that accepts its own actions at B <= {level:g} at most, received one that does at {system.accepted:g}")
     writer = _Writer(onnx)
     outputs = [writer.graph(graph) for graph in (system.barrier, system.looped)]
-    folder = Path(directory)
-    folder.mkdir(parents=True, exist_ok=True)
-    onnx.save(writer.model(outputs, system.latent_dim), folder / NETWORK)
-    lines = [f"(declare-const X_{i} Real)" for i in range(system.latent_dim)] + [f"(declare-const Y_{k} Real)" for k in (0, 1)]
+    least = [system.accepted, *[level] * (len(system.inner) - 1)] if system.chooses else [level]
+    network = writer.model(outputs, system.latent_dim, 1 + len(least)).SerializeToString()
+    lines = [f"(declare-const X_{i} Real)" for i in range(system.latent_dim)]
+    lines += [f"(declare-const Y_{k} Real)" for k in range(1 + len(least))]
     for i, (low, high) in enumerate(zip(system.low.tolist(), system.high.tolist(), strict=True)):
         lines += [f"(assert (>= X_{i} {low:.17g}))", f"(assert (<= X_{i} {high:.17g}))"]
-    lines += [f"(assert (<= Y_0 {level:.17g}))", f"(assert (>= Y_1 {level:.17g}))"]
-    (folder / PROPERTY).write_text("\n".join(lines) + "\n")
-    return folder / NETWORK, folder / PROPERTY
+    lines += [f"(assert (<= Y_0 {level:.17g}))", *(f"(assert (>= Y_{k} {v:.17g}))" for k, v in enumerate(least, start=1))]
+    return write(Path(directory) / NETWORK, network), write(Path(directory) / PROPERTY, "\n".join(lines) + "\n")
 
 
 class _Writer:
@@ -102,10 +105,10 @@ class _Writer:
         falling = self.node("MatMul", fall, self.constant(-np.eye(size)))
         return self.node("Add", self.node("Add", rise, falling), self.constant(np.full((1, size), low)))
 
-    def model(self, outputs: list[str], size: int) -> Any:
+    def model(self, outputs: list[str], size: int, values: int) -> Any:
         helper, kind = self.onnx.helper, self.onnx.TensorProto.FLOAT
         self.nodes.append(helper.make_node("Concat", outputs, ["Y"], axis=1))
-        shapes = [helper.make_tensor_value_info(n, kind, [1, k]) for n, k in (("X", size), ("Y", len(outputs)))]
+        shapes = [helper.make_tensor_value_info(n, kind, [1, k]) for n, k in (("X", size), ("Y", values))]
         graph = helper.make_graph(self.nodes, "invariance", shapes[:1], shapes[1:], self.constants)
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)])
         model.ir_version = 8  # older readers know it

@@ -190,7 +190,7 @@ class StateBlocks:
         unsafe_latent = self._see(torch.cat([env.previous_state(uniform), before]), unsafe_state)
         safe_state = env.sample_states(n, g, region=env.safe_set)
         safe_latent, reference_state = self._see(None, safe_state), env.sample_states(4 * n, g)
-        unsafe, safe = (agent.barrier(z)[:, 0] for z in (unsafe_latent, safe_latent))
+        unsafe, safe = agent.least_barrier(unsafe_latent), agent.barrier(safe_latent)[:, 0]
         latent = torch.cat([inside, unsafe_latent, safe_latent])
         beyond = ~(latent.abs() <= 1.0).all(1)
         run = self._run(start) if len(start) else None

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, maximise
+from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import (
     ASSUMED,
     TOLERATED,
@@ -33,7 +33,7 @@ from torchrl_sspl.certification.certificate import (
     weights_digest,
 )
 from torchrl_sspl.certification.conditions import closed_loop, tolerates
-from torchrl_sspl.certification.floating import UNITS, largest_rounding
+from torchrl_sspl.certification.floating import UNITS
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
 from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.rounding import missed, shown
@@ -52,6 +52,7 @@ from torchrl_sspl.evaluation.blocks import (
     summarise,
 )
 from torchrl_sspl.modules.agent import Agent, agent_directory
+from torchrl_sspl.modules.choosing import ChoosingPolicy
 
 CERTIFICATE_FILE = "certificate.json"
 _BROKEN = (SSPLError, ImportError, RuntimeError, TypeError, ValueError)
@@ -65,6 +66,7 @@ _CUT = 1e-6
 _LATE = 200
 #: How far beyond the Lipschitz argument a tolerated error is looked for, in how many steps, and with how many boxes each.
 _FARTHEST, _HALVINGS, _PATIENCE = 1.7, 4, 50_000
+_ROUNDINGS = ("barrier_rounding", "step_rounding")
 
 
 class Exit(IntEnum):
@@ -278,11 +280,10 @@ def premise(agent: Agent, *, budget: Budget | None = None) -> float:
     if not layer.holds or found is None:
         return 0.0
     system, unit = closed_loop(**_loop(agent)), UNITS[next(agent.barrier.parameters()).dtype]
-    names = {"barrier_rounding": system.barrier, "step_rounding": system.step}
-    rounding = {k: largest_rounding(graph, system.low, system.high, unit) for k, graph in names.items()}
+    rounding: dict[str, Any] = dict(zip(_ROUNDINGS, system.rounding(unit), strict=True))
     low, high = 0.999 * found, _FARTHEST * found
     budget = replace(budget, boxes=min(budget.boxes, _PATIENCE))
-    for _ in range(_HALVINGS):  # the Lipschitz constant says too little where the barrier rises slowly
+    for _ in range(0 if system.chooses else _HALVINGS):  # the Lipschitz constant says too little where the barrier rises slowly
         middle = math.sqrt(low * high)
         if tolerates(system, middle, budget=budget, **rounding).status == "proved":
             low = middle
@@ -333,7 +334,7 @@ def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> 
     return {
         "statistical": statistical_layer(record),
         "run-time": run_time_layer(record, _tolerated(certificate, agent), holds_at(agent, certificate.level)),
-        "paper": paper_layer(record, agent.lipschitz_bound),
+        "paper": paper_layer(record, agent.lipschitz_bound, chooses=isinstance(agent.policy, ChoosingPolicy)),
     }
 
 
@@ -476,17 +477,11 @@ def _history(claimed: Certificate, agent: Agent) -> dict[Reason, str]:
 
 def _is_proved(agent: Agent, level: float, name: str, delta: float, budget: Budget) -> bool | None:
     """Whether the set is kept with errors of delta, by real numbers or by those of a dtype; None: not decided."""
-    bound = agent.lipschitz_bound
     system = closed_loop(**_loop(agent))
-    inside, lost = level, 0.0
-    if name != TOLERATED:
-        unit = UNITS[getattr(torch, name)]
-        of_barrier, of_step = (
-            largest_rounding(g, system.low, system.high, unit) for g in (system.barrier, system.step)
-        )
-        inside, lost = level + of_barrier + SLACK, of_step + of_barrier / bound
-    problem = system.problem(level=inside, constant=(bound * (delta + lost) - level,))
-    return {"proved": True, "refuted": False}.get(maximise(problem, threshold=0.0, budget=budget).status)
+    rounding = (0.0, 0.0) if name == TOLERATED else system.rounding(UNITS[getattr(torch, name)])
+    of: dict[str, Any] = dict(zip(_ROUNDINGS, rounding, strict=True))
+    found = tolerates(system, delta, level=level, every_way=False, budget=budget, **of)
+    return {"proved": True, "refuted": False}.get(found.status)
 
 
 def _measured_again(

@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation.measurements import Draw
 from torchrl_sspl.modules.agent import Agent, hosted
-from torchrl_sspl.modules.controller import Memory
+from torchrl_sspl.modules.controller import Memory, meets_premise
 
 CHUNK = 1000  # frames drawn and encoded at a time
 _NONE: Any = None
@@ -171,7 +171,7 @@ class AgentController:
     def _judge(self, observation: Tensor | Camera, rows: Tensor | None) -> Decision:
         """What is thought of all n episodes after a look at some of them."""
         seen, barrier = self._see(observation, rows), self.agent.barrier
-        latent, innovation, cut = self._memory.correct(seen)
+        latent, innovation, cut, seen = self._memory.correct(seen)
         return Decision(barrier=barrier(latent)[:, 0], seen=barrier(seen)[:, 0], latent=latent, innovation=innovation, cut=cut)
 
     def _see(self, observation: Tensor | Camera, rows: Tensor | None) -> Tensor:
@@ -192,6 +192,14 @@ class AgentController:
             latent = self._seen.index_copy(0, rows, latent)
         self._seen = latent
         return latent
+
+
+def covered(run: Any, agent: Agent) -> Tensor:
+    """``(n,)`` bool, episodes from the first to the last observation of which the premise of an agent's proof is met; none where nothing
+    is proved. The episodes are those of a simulation with the agent. Source: none."""
+    error = torch.cat([torch.zeros_like(run.prediction_error[:1]), run.prediction_error])  # nothing was expected at first
+    met = meets_premise(agent, run.barrier, run.seen, error)
+    return (met | ~run.alive).all(0)
 
 
 class _FunctionController:

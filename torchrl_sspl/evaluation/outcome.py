@@ -157,7 +157,6 @@ def write_metrics(outcome: Outcome) -> Path:
     }
     text = json.dumps(_without_paths(body), indent=1, sort_keys=True) + "\n"
     path = Path(outcome.directory) / METRICS_FILE
-    path.parent.mkdir(parents=True, exist_ok=True)
     write(path, text)
     beside = path.parent / "agent"
     if outcome.seconds is not None and beside.is_dir():

@@ -10,7 +10,7 @@ from torch import Tensor
 from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.evaluation.controllers import Controller, as_controller
+from torchrl_sspl.evaluation.controllers import Controller, as_controller, covered
 from torchrl_sspl.evaluation.known import barrier_of
 from torchrl_sspl.evaluation.measurements import Evaluation, share
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
@@ -64,6 +64,10 @@ def evaluate_physics(
             if name == "walks_from_safe_hit" and groups:
                 happened = happened | groups[k].events["entered"]
             out.add(share(name, int(happened.sum()), len(starts[k][1]), f"{length} {where}"))
+    held = getattr(acts, "agent", None)
+    if held is not None and held.tolerated_error > 0.0 and len(groups) > 1:
+        k, note = int(covered(groups[1], held).sum()), "the premise of the proof is met at every step"
+        out.add(share("walks_from_set_covered", k, len(groups[1]), f"{length} {where}; {note}"))
     return out, groups
 
 

@@ -237,21 +237,21 @@ LAYERS: dict[type[nn.Module], Callable[[Any], Activation | None]] = {
 #: Their forward methods as they were when they became known.
 ORIGINAL: dict[type[nn.Module], Callable[..., Tensor]] = {k: k.forward for k in (*LAYERS, nn.Sequential)}  # type: ignore[attr-defined]
 #: Modules that are more than layers in a row, by exact type, and the form of what they compute. "residual":
-#: clamp(z + net(z, u / action_scale), -1, 1); "bounded": action_scale clamp(net(z), -1, 1).
+#: clamp(z + net(z, u / action_scale), -1, 1); "bounded": action_scale clamp(net(z), -1, 1); "choosing": modules.ChoosingPolicy.
 FORMS: dict[type[nn.Module], str] = {}
 #: Modules whose ``collapse()`` gives the plain network that is deployed in their place, by exact type.
 COLLAPSIBLE: set[type[nn.Module]] = set()
 
 
 def known_form(form: str) -> Callable[[type], type]:
-    """Decorator of a module whose forward is "residual" or "bounded" (:data:`FORMS`); values are compared nevertheless.
+    """Decorator of a module whose forward is of one of the :data:`FORMS`; values are compared nevertheless.
 
     Example:
         >>> FORMS.pop(known_form("bounded")(type("Mine", (nn.Module,), {})))
         'bounded'
     """
-    if form not in ("residual", "bounded"):
-        raise ConfigError(f"expected the form 'residual' or 'bounded', received {form!r}")
+    if form not in ("residual", "bounded", "choosing"):
+        raise ConfigError(f"expected the form 'residual', 'bounded' or 'choosing', received {form!r}")
 
     def register(kind: type) -> type:
         FORMS[kind], ORIGINAL[kind] = form, kind.forward  # type: ignore[attr-defined]

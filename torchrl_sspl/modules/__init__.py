@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from torchrl_sspl.modules.moments import MomentEncoder, ShapeEncoder
+from torchrl_sspl.modules.choosing import ChoosingPolicy
+from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
 from torchrl_sspl.modules.observer import LatentObserver, Predict
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
 
 __all__ = [
+    "BearingEncoder",
+    "ChoosingPolicy",
     "FrameEncoder",
     "InverseDynamics",
     "LatentDynamics",

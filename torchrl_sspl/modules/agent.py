@@ -22,15 +22,17 @@ from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.files import write
 from torchrl_sspl.lipschitz import prove_lipschitz
+from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.modules.controller import Controller
 from torchrl_sspl.modules.export import export
-from torchrl_sspl.modules.moments import MomentEncoder, ShapeEncoder
+from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
 from torchrl_sspl.modules.observer import gain_matrix
 
 WEIGHTS_FILE = "agent.safetensors"
 DESCRIPTION_FILE = "agent.json"
 FORMAT_VERSION = 1
+_HELD = 9  # values of what a memory may hold, per entry
 
 
 def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
@@ -45,10 +47,10 @@ def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
 
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
 ENCODERS: dict[str, type[nn.Module]] = {
-    "FrameEncoder": FrameEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder,
+    "FrameEncoder": FrameEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder, "BearingEncoder": BearingEncoder,
 }  # fmt: skip
 DYNAMICS: dict[str, type[nn.Module]] = {"LatentDynamics": LatentDynamics}
-POLICIES: dict[str, type[nn.Module]] = {"Policy": Policy}
+POLICIES: dict[str, type[nn.Module]] = {"ChoosingPolicy": ChoosingPolicy, "Policy": Policy}
 
 
 class Agent(nn.Module):
@@ -63,7 +65,8 @@ class Agent(nn.Module):
         encoder: pixels ``(*batch, 6, H, W)`` uint8 -> latent ``(*batch, p)`` in [-1, 1].
         dynamics: latent ``(*batch, p)``, action ``(*batch, m)`` in physical units -> next latent ``(*batch, p)``.
         barrier: latent ``(*batch, p)`` -> ``(*batch, 1)``; at most zero means safe.
-        policy: latent ``(*batch, p)`` -> action ``(*batch, m)`` in physical units (N m, rad/s).
+        policy: latent ``(*batch, p)`` -> action ``(*batch, m)`` in physical units (N m, rad/s); a
+            :class:`~torchrl_sspl.modules.ChoosingPolicy` chooses by this agent's dynamics and barrier.
         lipschitz_bound: the proved Lipschitz constant of ``barrier`` with respect to the Euclidean norm.
         description: how to build the networks again, and whatever else should travel with the agent;
             ``"tolerated_error"`` is the error below which its proof applies at run time.
@@ -99,7 +102,11 @@ class Agent(nn.Module):
                 f"expected a plain barrier (a Sequential that begins with a Linear), received {type(self.barrier).__name__}; "
                 "Agent.from_networks(...) and Agent.from_loss(loss) collapse it and prove its Lipschitz bound"
             )
+        if isinstance(self.policy, ChoosingPolicy):
+            self.policy.bind(self.dynamics, self.barrier)
         self.lipschitz_bound = float(lipschitz_bound)
+        if not 0.0 < self.lipschitz_bound < math.inf:
+            raise ConfigError(f"expected a Lipschitz bound that is finite and above zero, received {lipschitz_bound}")
         self.description: dict[str, Any] = dict(description or {})
         self.register_buffer("gain", gain_matrix(gain, self.latent_dim))
         error = self.description.get("tolerated_error", 0.0)
@@ -118,6 +125,8 @@ class Agent(nn.Module):
         *,
         level: float = 0.0,
         gain: float | Tensor = 1.0,
+        choices: Tensor | None = None,
+        choice_margin: float = 0.0,
         description: dict[str, Any] | None = None,
     ) -> Agent:
         """A frozen copy, on the CPU, of networks in training; the barrier collapsed to a plain one, its bound proved.
@@ -127,6 +136,8 @@ class Agent(nn.Module):
             barrier: a Lipschitz barrier of this library.
             level: {B <= level} becomes {B <= 0}.
             gain: K of the latent observer.
+            choices: table of actions ``(K, m)``, physical units: the policy becomes a
+                :class:`~torchrl_sspl.modules.ChoosingPolicy` of the deployed barrier, with this ``choice_margin``.
             description: whatever should travel with the agent.
 
         Source: none.
@@ -141,6 +152,8 @@ class Agent(nn.Module):
         deployed, bound = nets[2].collapse(), float(nets[2].lipschitz_bound)  # type: ignore[arg-type, operator]
         with torch.no_grad():
             deployed[-1].bias.sub_(level)
+        if choices is not None:
+            nets[3] = ChoosingPolicy(nets[3], choices, choice_margin)
         witness = [m.tolist() for m in nets[2].multipliers()]  # type: ignore[operator]
         proof = prove_lipschitz(deployed, bound, multipliers=[torch.tensor(m) for m in witness])
         hidden = [layer.out_features for layer in deployed if isinstance(layer, nn.Linear)][:-1]
@@ -167,6 +180,21 @@ class Agent(nn.Module):
         """Action ``(*batch, m)`` in physical units and barrier value ``(*batch, 1)``; pixels as for :meth:`encode`."""
         latent = self.encode(pixels)
         return self.policy(latent), self.barrier(latent)
+
+    @torch.no_grad()
+    def least_barrier(self, latent: Tensor) -> Tensor:
+        """Smallest barrier value ``(n,)`` of what is seen ``(n, p)``, whatever the memory holds beside it.
+
+        Entries that no picture shows (those that K leaves to the memory) take values on a grid; without any it is B(z).
+        """
+        hidden = (~(self.gain != 0).any(0)).nonzero()[:, 0]
+        if not len(hidden):
+            return self.barrier(latent)[:, 0]
+        held = torch.linspace(-1.0, 1.0, _HELD, device=latent.device)
+        held = torch.cartesian_prod(*[held] * len(hidden)).reshape(-1, len(hidden))
+        tried = latent.expand(len(held), *latent.shape).clone()
+        tried[..., hidden] = held[:, None]
+        return self.barrier(tried)[..., 0].amin(0)
 
     def controller(self, batch_size: int = 1) -> Controller:
         """What runs on n systems side by side: with a memory of its own, and the premise of the proof watched.
@@ -205,6 +233,7 @@ class Agent(nn.Module):
 
         Raises:
             ConfigError: if the agent has no description of its networks.
+            OutputError: if it cannot be written.
         """
         if "networks" not in self.description:
             raise ConfigError(
@@ -212,7 +241,6 @@ class Agent(nn.Module):
                 " received none; build the agent with a description to save it"
             )
         path = Path(path)
-        path.mkdir(parents=True, exist_ok=True)
         write(path / WEIGHTS_FILE, as_bytes({k: v.contiguous() for k, v in self.state_dict().items()}))
         body = {"format": FORMAT_VERSION, "lipschitz_bound": self.lipschitz_bound, **self.description}
         write(path / DESCRIPTION_FILE, json.dumps(body, indent=1, sort_keys=True) + "\n")
@@ -349,6 +377,7 @@ def _describe(network: nn.Module, latent_dim: int) -> dict[str, Any]:
     if module == "__main__":  # of a program: others find the class in its file
         module = Path(getattr(sys.modules[module], "__file__", None) or module).stem
     arguments = getattr(network, "arguments", None) or {"latent_dim": latent_dim}
+    arguments = {k: _describe(v, latent_dim) if isinstance(v, nn.Module) else v for k, v in arguments.items()}
     return {"class": f"{module}:{kind.__qualname__}" if own else kind.__name__, "arguments": arguments}
 
 
@@ -359,8 +388,10 @@ def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any]) -> nn.Mod
             f"expected one of the networks {sorted(registry)}, received '{name}'; name a network of your own as "
             "package.module:Class, or add it to the registries of torchrl_sspl.modules.agent before loading"
         )
+    nested = {k: _build(registry, v) for k, v in spec["arguments"].items() if isinstance(v, dict) and "class" in v}
+    arguments = spec["arguments"] | nested
     try:
-        return registry[name](**spec["arguments"]) if name in registry else call_with(resolve(name), spec["arguments"])
+        return registry[name](**arguments) if name in registry else call_with(resolve(name), arguments)
     except ConfigError as error:
         raise CheckpointError(f"the network '{name}' cannot be built: {error}") from error
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.modules.observer import corrected, held
+from torchrl_sspl.modules.observer import completed, corrected, held
 
 
 class Memory:
@@ -22,7 +22,7 @@ class Memory:
     Example:
         >>> from torchrl_sspl.modules.agent import load
         >>> memory = Memory(load("pendulum"))
-        >>> latent, innovation, cut = memory.correct(torch.zeros(2, 3))
+        >>> latent, innovation, cut, seen = memory.correct(torch.zeros(2, 3))
         >>> memory.expect(latent + 0.1)
         >>> bool((memory.correct(torch.zeros(2, 3))[0] > 0).all())
         True
@@ -40,15 +40,16 @@ class Memory:
         elif self.begins is not None:
             self.begins[rows] = True
 
-    def correct(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Latents and innovations ``(n, p)`` for what is seen ``(n, p)``, and where a correction was cut ``(n,)``; nothing is
-        remembered."""
+    def correct(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Latents and innovations ``(n, p)`` for what is seen ``(n, p)``, where a correction was cut ``(n,)``, and what is seen
+        with what no picture shows; nothing is remembered."""
         if self.begins is None or self.prior is None:
             self.prior, self.begins = seen, torch.ones(len(seen), dtype=torch.bool, device=seen.device)
         expected, agent = torch.where(self.begins[:, None], seen, self.prior), self.agent
+        seen = completed(seen, expected, agent.gain)
         latent, innovation = corrected(expected, seen, agent.gain)
         latent, cut = held(agent.barrier, expected, latent, agent.held_error)
-        return latent, innovation, cut
+        return latent, innovation, cut, seen
 
     def unseen(self, n: int) -> Tensor:
         """Latents ``(n, p)`` where nothing is seen: what was expected; zeros where nothing was. Nothing is remembered."""
@@ -179,8 +180,8 @@ class Controller:
         elif len(pixels) != n:
             raise ShapeError(f"expected pixels of {n} systems, received {len(pixels)}; make a controller for them")
         else:
-            seen, rows = agent.encode(pixels.to(agent.gain.device)), None
-            latent, innovation, _ = memory.correct(seen)
+            latent, innovation, _, seen = memory.correct(agent.encode(pixels.to(agent.gain.device)))
+            rows = None
         action, barrier = agent.policy(latent), agent.barrier(latent)[:, 0]
         error = (latent - (seen - innovation)).norm(dim=-1)
         self._applies = self._applies & meets_premise(agent, barrier, agent.barrier(seen)[:, 0], error)

@@ -10,8 +10,16 @@ from torchrl_sspl.errors import ConfigError, EmptyRegionError
 from torchrl_sspl.modules.networks import FrameEncoder, mlp
 
 _NOISE = 0.05  # difference in [-1, 1] that is not seen
+_FAINT = 0.15  # the same of a bearing: the noise of a bad camera
 _VAGUE = 0.03  # scaled length below which a direction is none
 _WHOLE = 0.9  # of the usual covered share, from which a thing is seen as a whole
+
+
+def _background(frames: Tensor) -> Tensor:
+    """The median ``(c, H, W)`` of frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
+    if len(frames) < 10:
+        raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
+    return frames[:2000].median(0).values
 
 
 class ColourMoments(nn.Module):
@@ -63,9 +71,7 @@ class ColourMoments(nn.Module):
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
         """Take background and whitening from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
-        if len(frames) < 10:
-            raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
-        self.background.copy_(frames[:2000].median(0).values)
+        self.background.copy_(_background(frames))
         centre = torch.cat([self.centres(part) for part in frames.split(32)]).double()
         values, vectors = torch.linalg.eigh(torch.cov(centre.T))
         kept = self.whitening.shape[1]
@@ -195,9 +201,7 @@ class ShapeMoments(nn.Module):
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
         """Take background and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
-        if len(frames) < 10:
-            raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
-        self.background.copy_(frames[:2000].median(0).values)
+        self.background.copy_(_background(frames))
         found = torch.cat([self.moments(part) for part in frames.split(32)])
         # One scale for both directions: turning the frame turns what is seen.
         pairs = found[:, :4].unflatten(-1, (2, 2)).square().mean((0, 2)).sqrt()
@@ -256,3 +260,132 @@ class ShapeEncoder(MomentEncoder):
         ahead = ahead / (ahead.square().sum(-1, keepdim=True) + _VAGUE**2).sqrt()
         seen = torch.cat([current[..., :2], ahead], -1)
         return torch.tanh(self.gain * F.pad(seen, (0, self.latent_dim - 4)) + self.latent_head(seen))
+
+
+class Bearing(nn.Module):
+    r"""Where the thing that stands still lies, seen from the one that moves, in its own directions.
+
+    .. math:: w_k = \max(0, |\kappa_k f_k - b_k| - \epsilon), \qquad c = \tfrac{1}{K} \sum_k c_k, \qquad e = \sum_k \alpha_k c_k, \qquad
+        h = \frac{1}{\|e\|} \begin{pmatrix} e_1 & e_2 \\ -e_2 & e_1 \end{pmatrix} (q - c)
+
+    with the centre :math:`c_k` of the weight :math:`w_k` of colour k on plain ground. What a camera's noise changes is no thing
+    (:math:`\epsilon`), nor are another brightness (:math:`\kappa_k` makes the plain ground as bright as it was) and edges of the
+    background that a camera shifted by a pixel moves (only plain ground counts). Where the ends of what moves differ in colour,
+    e points from one to the other: :math:`\alpha`, of sum zero, is the contrast of colours whose centres differ most. The place q
+    is the middle of what is not plain ground, the middle of the frame where all of it is. Background b and all statistics come
+    from frames alone and are set by :meth:`fit`. Distances are in half widths of the frame. Source: none.
+
+    Args:
+        size: height and width of the (pooled) frames.
+        channels: colours, at least two.
+
+    Example:
+        >>> frames = torch.ones(50, 3, 16, 16)
+        >>> places = torch.randint(15, (50, 2), generator=torch.Generator().manual_seed(0))
+        >>> rows = torch.arange(50)
+        >>> frames[rows, 0, places[:, 0], places[:, 1]] = 0.0  # one end
+        >>> frames[rows, 1:, places[:, 0], places[:, 1] + 1] = 0.0  # the other, to the right of it
+        >>> bearing = Bearing(16)
+        >>> bearing.fit(frames)
+        >>> bearing(frames).shape
+        torch.Size([50, 2])
+    """
+
+    background: Tensor
+    ground: Tensor
+    light: Tensor
+    contrast: Tensor
+    anchor: Tensor
+    axis: Tensor
+
+    def __init__(self, size: int, channels: int = 3) -> None:
+        super().__init__()
+        self.register_buffer("background", torch.ones(channels, size, size))
+        self.register_buffer("ground", torch.ones(size, size))  # 1 where it is plain
+        self.register_buffer("light", torch.full((channels,), 2.0 * size * size))  # on it, black counts zero
+        self.register_buffer("contrast", torch.zeros(channels))
+        self.register_buffer("anchor", torch.zeros(2))
+        self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
+
+    def _centres(self, frames: Tensor) -> Tensor:
+        """Centres ``(n, 2, c)`` of the colours of frames ``(n, c, H, W)`` in [-1, 1], x to the right and y down."""
+        light = ((frames + 1.0) * self.ground).sum((-2, -1))
+        factor = (self.light / light.clamp_min(1e-3)).clamp(0.5, 2.0)[..., None, None]
+        off = ((frames + 1.0) * factor - 1.0 - self.background).abs()
+        weight = (off - _FAINT).clamp_min(0.0) * self.ground
+        # Less than one pixel in a thousand counts as nothing seen: the middle of the frame.
+        mass = weight.sum((-2, -1)).clamp_min(1e-3 * self.axis.numel())
+        return torch.stack([(weight.sum(-2) @ self.axis) / mass, (weight.sum(-1) @ self.axis) / mass], 1)
+
+    def centres(self, frames: Tensor) -> Tensor:
+        """As :meth:`_centres`, a few frames at a time, which stay in the cache; an exported graph has no loop."""
+        parts = [frames] if torch.compiler.is_exporting() else frames.split(32)
+        return torch.cat([self._centres(part) for part in parts])
+
+    @torch.no_grad()
+    def fit(self, frames: Tensor) -> None:
+        """Take everything from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
+        self.background.copy_(_background(frames))
+        off = (self.background - self.background.flatten(1).median(1).values[:, None, None]).abs().amax(0)
+        thing = torch.where(off > _NOISE, off, 0.0)
+        mass = thing.sum().clamp_min(1e-3 * self.axis.numel())
+        self.anchor.copy_(torch.stack([(thing.sum(0) @ self.axis) / mass, (thing.sum(1) @ self.axis) / mass]))
+        self.ground.copy_(1.0 - F.max_pool2d((thing > 0.0).float()[None], 3, 1, 1)[0])
+        self.light.copy_(((self.background + 1.0) * self.ground).sum((-2, -1)))
+        centres = self.centres(frames).double()
+        apart = centres - centres.mean(-1, keepdim=True)
+        _, vectors = torch.linalg.eigh(torch.einsum("nik,nil->kl", apart, apart))
+        self.contrast.copy_(vectors[:, -1] - vectors[:, -1].mean())
+
+    def forward(self, frames: Tensor) -> Tensor:
+        """Place of the still thing ``(n, 2)``, ahead and aside of the moving one, of frames ``(n, c, H, W)``."""
+        centres = self.centres(frames)
+        ahead = centres @ self.contrast
+        ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
+        away = self.anchor - centres.mean(-1)
+        return torch.stack([(ahead * away).sum(-1), ahead[:, 0] * away[:, 1] - ahead[:, 1] * away[:, 0]], -1)
+
+
+class BearingEncoder(MomentEncoder):
+    r"""Frame encoder that sees where the thing that stands still lies, seen from the one that moves.
+
+    .. math:: z_t = (\tanh(h_t / r), 0) \in (-1, 1)^p
+
+    with h of :class:`Bearing` and a reach r. For a robot that has to keep away from an obstacle this is a latent of two numbers
+    that the data fill: there is nothing off the manifold. What is turned or mirrored with the robot looks the same, so that
+    a square obstacle counts as the disc around it. Entries beyond the second are zero and left to the memory
+    (:class:`~torchrl_sspl.modules.LatentDynamics` with ``remembers``). There is no weight to train; :meth:`fit` takes the
+    statistics from frames. Sizes that are not valid are a ConfigError. Source: paper eq. (7); the paper does not give an
+    architecture.
+
+    Args:
+        latent_dim: size p of the latent, at least two.
+        image_size: height and width of the frames in pixels; ``None`` accepts any size.
+        pool_to: height and width after average pooling.
+        reach: r, in half widths of the frame.
+
+    Example:
+        >>> BearingEncoder(latent_dim=3, image_size=128)(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
+        torch.Size([2, 3])
+    """
+
+    seen_dim = 2
+
+    def __init__(
+        self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, reach: float = 0.625
+    ) -> None:
+        if latent_dim < self.seen_dim or not reach > 0.0:
+            raise ConfigError(f"expected latent_dim >= 2 and reach > 0, received {latent_dim} and {reach}")
+        super().__init__(self.seen_dim, image_size, pool_to=pool_to)
+        self.latent_dim, self.reach = latent_dim, float(reach)
+        self.trunk, self.latent_head = nn.Sequential(Bearing(pool_to, self.in_channels)), nn.Sequential()
+        self.gain.data.fill_(1.0 / self.reach)
+        self.gain.requires_grad_(False)
+        self.arguments = {"latent_dim": latent_dim, "image_size": self.arguments["image_size"], "pool_to": pool_to, "reach": self.reach}
+
+    def _weight(self) -> Tensor:
+        return self.gain
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the bearings of two successive frames, of which the second counts; see :meth:`FrameEncoder.head`."""
+        return F.pad(torch.tanh(self.gain * current), (0, self.latent_dim - self.seen_dim))

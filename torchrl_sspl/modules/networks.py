@@ -188,12 +188,15 @@ class FrameEncoder(nn.Module):
                 f"and image_size=None accepts any height and width"
             )
 
+    def _weight(self) -> Tensor:
+        """One of the weights. Not ``next(self.parameters())``: a delayed copy has none."""
+        return cast(Tensor, self.latent_head[0].weight)
+
     def frames(self, frames: Tensor) -> Tensor:
         """Features ``(*batch, features)`` of single frames ``(*batch, 3, H, W)`` uint8."""
         self._check(frames, self.in_channels, "frames")
         batch = frames.shape[:-3]
-        # Not next(self.parameters()): a delayed copy of the weights has none.
-        dtype = cast(Tensor, self.latent_head[0].weight).dtype
+        dtype = self._weight().dtype
         flat = frames.reshape(-1, *frames.shape[-3:])
         if flat.device.type == "cpu" and not torch.compiler.is_compiling():
             # A few frames at a time stay in the cache: more than twice as fast, the same numbers.
@@ -282,12 +285,18 @@ class LatentDynamics(_OfLatents):
     .. math:: d(z, u) = \operatorname{clamp}(z + \operatorname{net}(z, u / u_{\max}), -1, 1)
 
     The residual form makes "nothing moves" the easy guess. See :func:`inward_clamp` for the gradient.
+    With ``remembers`` the last entries of the latent are the action of the step before,
+
+    .. math:: d((y, a), u) = \operatorname{clamp}((y + \operatorname{net}(y, a, u / u_{\max}), u / u_{\max}), -1, 1)
+
+    which a system that acts late needs, and which no picture shows: an observer keeps them.
     Source: paper eq. (8), third term; the paper does not give an architecture.
 
     Args:
         latent_dim, action_dim: sizes of latent and action.
         hidden: widths of the hidden layers (ReLU).
         action_scale: physical units per unit of normalised action, a number or one per dimension.
+        remembers: whether the last ``action_dim`` entries of the latent are the action before.
 
     Raises:
         ConfigError: if a size or the scale is not valid.
@@ -298,13 +307,35 @@ class LatentDynamics(_OfLatents):
         torch.Size([5, 2])
     """
 
-    _reads, _gives = ("latent_dim", "action_dim"), "latent_dim"
+    _reads, _gives = ("latent_dim", "action_dim"), "moving_dim"
+
+    def __init__(
+        self,
+        latent_dim: int,
+        action_dim: int,
+        hidden: Sequence[int] = (64, 64),
+        action_scale: float | Sequence[float] | Tensor = 1.0,
+        remembers: bool = False,
+    ) -> None:
+        self.remembers = remembers
+        if remembers and not latent_dim > action_dim:
+            raise ConfigError(f"expected latent_dim > action_dim={action_dim} to remember actions, received {latent_dim}")
+        super().__init__(latent_dim, action_dim, hidden, action_scale)
+        if remembers:
+            self.arguments["remembers"] = True
+
+    @property
+    def moving_dim(self) -> int:
+        """Entries of the latent that the network predicts."""
+        return self.latent_dim - self.action_dim if self.remembers else self.latent_dim
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
         """Next latent in ``[-1, 1]`` of latents ``(*batch, p)``, actions ``(*batch, action_dim)`` in physical units."""
         _check_last(latent, self.latent_dim, "latent")
         _check_last(action, self.action_dim, "action")
-        return inward_clamp(latent + self.net(torch.cat([latent, action / self.action_scale], -1)))
+        action = action / self.action_scale
+        moved = latent[..., : self.moving_dim] + self.net(torch.cat([latent, action], -1))
+        return inward_clamp(torch.cat([moved, action], -1) if self.remembers else moved)
 
 
 @known_form("bounded")

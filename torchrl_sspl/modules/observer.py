@@ -16,12 +16,13 @@ from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.modules.salad import as_tensordict_module
 
 
-def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int) -> Tensor:
+def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int, seen_dim: int | None = None) -> Tensor:
     """The gain K ``(p, p)`` of an observer, from a number k (K = k I) or a matrix. Source: none.
 
     Args:
         gain: k or K; 1 or the identity: what is seen is believed as it is.
         latent_dim: p.
+        seen_dim: leading entries of the latent that pictures show; of a number k, K is zero on the others. Default: p.
 
     Raises:
         ConfigError: if it has another shape, or is not finite, or I - K is longer than 1 in some direction (the observer
@@ -32,7 +33,8 @@ def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int) -> Tensor
         [[0.5, 0.0], [0.0, 0.5]]
     """
     given = torch.as_tensor(gain, dtype=torch.float32).detach().cpu()
-    matrix = given * torch.eye(latent_dim) if given.ndim == 0 else given.clone()
+    shows = torch.arange(latent_dim) < (latent_dim if seen_dim is None else seen_dim)
+    matrix = given * torch.diag(shows.float()) if given.ndim == 0 else given.clone()
     if matrix.shape != (latent_dim, latent_dim) or not bool(matrix.isfinite().all()):
         raise ConfigError(
             f"expected a gain that is a finite number or a ({latent_dim}, {latent_dim}) matrix, received {tuple(given.shape)}"
@@ -43,6 +45,18 @@ def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int) -> Tensor
             f"expected a gain K with |I - K| <= 1 that is not zero, such as a number in (0, 1], received |I - K| = {left:.3g}"
         )
     return matrix
+
+
+def completed(seen: Tensor, prior: Tensor, gain: Tensor) -> Tensor:
+    """What is seen, with the entries that no picture shows as they were expected: those that no column of K reads.
+
+    Latents ``(*batch, p)``, gain ``(p, p)``. Source: none.
+
+    Example:
+        >>> completed(torch.zeros(1, 2), torch.ones(1, 2), torch.tensor([[0.5, 0.0], [0.0, 0.0]])).tolist()
+        [[0.0, 1.0]]
+    """
+    return torch.where((gain != 0).any(0), seen, prior)
 
 
 def corrected(prior: Tensor, seen: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
@@ -149,7 +163,7 @@ class LatentObserver(TensorDictModuleBase):
         if prior.shape != seen.shape:
             raise ShapeError(f"expected a prior of shape {tuple(seen.shape)}, received {tuple(prior.shape)}; add the primer")
         expected = torch.where(begins, seen, prior)
-        latent, innovation = corrected(expected, seen, self.gain)
+        latent, innovation = corrected(expected, completed(seen, expected, self.gain), self.gain)
         if self.barrier is not None:
             latent = held(self.barrier, expected, latent, self.error)[0]
         return tensordict.set(self.out_keys[0], latent).set("innovation", innovation)
@@ -206,11 +220,12 @@ def filtered(
     latent, after = seen.clone(), next_seen.clone()
     rows = (~continues).nonzero()[:, 0]
     while len(rows):
-        after[rows] = corrected(dynamics(latent[rows], action[rows]), next_seen[rows], gain)[0]
+        prior = dynamics(latent[rows], action[rows])
+        after[rows] = corrected(prior, completed(next_seen[rows], prior, gain), gain)[0]
         rows = rows[rows + 1 < len(seen)] + 1
         rows = rows[continues[rows]]
         latent[rows] = after[rows - 1]
     return latent, after
 
 
-__all__ = ["LatentObserver", "Predict", "corrected", "filtered", "gain_matrix", "held"]
+__all__ = ["LatentObserver", "Predict", "completed", "corrected", "filtered", "gain_matrix", "held"]

@@ -165,6 +165,7 @@ def viability_kernel(
     margin: Callable[[Tensor], Tensor] | None = None,
     actions: Tensor | None = None,
     exit_is_safe: bool | None = None,
+    errors: Tensor | None = None,
     saturation: float = 0.05,
     tolerance: float = 1e-4,
     max_iterations: int = 1000,
@@ -173,7 +174,7 @@ def viability_kernel(
 
     Iterates, without discount, until no value changes by more than ``tolerance``:
 
-        V_0 = l,    V_{k+1}(x) = min(l(x), max_u V_k(f(x, u)))
+        V_0 = l,    V_{k+1}(x) = min(l(x), max_u min_e V_k(f(x, u) + e))
 
     with ``l(x) > 0`` where the constraint holds and multilinear interpolation of ``V_k`` between the nodes.
     The kernel is ``{V > 0}``. Its border does not change when ``l`` is replaced by an increasing function of
@@ -192,6 +193,7 @@ def viability_kernel(
             plus-minus-one indicator works, less exactly).
         actions: ``(k, m)`` to choose from. Default: 21 equally spaced values of one component, 7 of each of several.
         exit_is_safe: whether leaving the box counts as safe. Default: what ``exit_region`` says, else no.
+        errors: ``(j, d)`` errors e, of which the worst is added to every successor, which stays in the box by that. Default: none.
         saturation: share of the largest value of ``l`` at which it is cut, above and below.
         tolerance: stop when no value changes by more than this share of the cut.
         max_iterations: stop at the latest after so many iterations.
@@ -212,7 +214,7 @@ def viability_kernel(
         >>> kernel.contains(torch.tensor([[0.19], [0.21]]))
         tensor([ True, False])
     """
-    problem = _Problem(system, low, high, resolution, period, margin, actions, exit_is_safe)
+    problem = _Problem(system, low, high, resolution, period, margin, actions, exit_is_safe, errors)
     if not 0 < saturation <= 1:
         raise ConfigError(f"saturation: expected a share in (0, 1], received {saturation!r}.")
     if float(problem.margin.max()) <= 0:
@@ -296,6 +298,7 @@ class _Problem:
         margin: Callable[[Tensor], Tensor] | None,
         actions: Tensor | None,
         exit_is_safe: bool | None,
+        errors: Tensor | None = None,
     ) -> None:
         dynamics: Dynamics = getattr(system, "dynamics", system)
         space = getattr(system, "state_space", None)
@@ -325,22 +328,30 @@ class _Problem:
         self.margin = margin(nodes)  # (nodes,)
         if self.margin.shape != nodes.shape[:1]:
             raise ShapeError(f"margin: expected shape {(nodes.shape[0],)}, received {tuple(self.margin.shape)}.")
-        self.successors = []  # per action: cell, position in it, outside
+        if errors is not None and (errors.ndim != 2 or errors.shape[1] != nodes.shape[1] or not len(errors)):
+            raise ShapeError(f"errors: expected shape (j, {nodes.shape[1]}), received {tuple(errors.shape)}.")
+        ends = [torch.tensor(v) for v in (self.grid.low, self.grid.high)]
+        self.successors = []  # per action, for every error: cell, position in it, outside
         for action in actions.to(nodes):
             after = dynamics(nodes, action.expand(nodes.shape[0], -1))
             if after.shape != nodes.shape:
                 raise ShapeError(f"dynamics: expected shape {tuple(nodes.shape)}, received {tuple(after.shape)}.")
             if torch.isnan(after).any():
                 raise NonFiniteError("dynamics: expected finite states, received NaN for a node of the grid.")
-            self.successors.append(self.grid.locate(after))
+            moved = [after] if errors is None else [torch.minimum(torch.maximum(after + e, ends[0]), ends[1]) for e in errors.to(after)]
+            self.successors.append([self.grid.locate(a) for a in moved])
 
     def best_successor(self, value: Tensor, cut: float) -> Tensor:
         """Largest value among the successors of each node, ``(nodes,)``; beyond the box it is +- ``cut``."""
         padded = self.grid.pad(value)
         beyond = value.new_tensor(cut if self.exit_is_safe else -cut)
         best = None
-        for index, inside_cell, outside in self.successors:
-            reached = torch.where(outside, beyond, self.grid.gather(padded, index, inside_cell))
+        for moved in self.successors:
+            reached = None
+            for index, inside_cell, outside in moved:
+                value_there = torch.where(outside, beyond, self.grid.gather(padded, index, inside_cell))
+                reached = value_there if reached is None else torch.minimum(reached, value_there, out=reached)
+            assert reached is not None
             best = reached if best is None else torch.maximum(best, reached, out=best)
         assert best is not None
         return best
