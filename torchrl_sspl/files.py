@@ -22,7 +22,8 @@ OWNER_FILE = ".owner.json"
 def write(path: str | Path, content: str | bytes) -> Path:
     """Write a file, or replace it in one step: whoever reads it sees all of the old or all of the new one.
 
-    Raises OutputError if that cannot be done; the old file is still there then. Source: none.
+    The directory is made if there is none. Raises OutputError if that cannot be done; the old file is still there then.
+    Source: none.
 
     Example:
         >>> write("a.txt", "new").read_text()
@@ -31,12 +32,28 @@ def write(path: str | Path, content: str | bytes) -> Path:
     path = Path(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         part.write_bytes(content.encode() if isinstance(content, str) else content)
         return part.replace(path)
     except OSError as error:
         with suppress(OSError):
             part.unlink(missing_ok=True)
         raise OutputError(f"expected to write '{path}', received {_reason(error)}; {path.name} is as it was before") from error
+
+
+def append(path: str | Path, line: str) -> None:
+    """Add a line to a file, which is made if there is none; raises OutputError if that cannot be done. Source: none.
+
+    Example:
+        >>> append("log.txt", "begun")
+    """
+    path = Path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with path.open("a") as file:
+            file.write(line + "\n")
+    except OSError as error:
+        raise OutputError(f"expected to add to '{path}', received {_reason(error)}; make room or repair it") from error
 
 
 class RunDirectory:
@@ -110,4 +127,4 @@ def _reason(error: OSError) -> str:
     return error.strerror or type(error).__name__
 
 
-__all__ = ["RunDirectory", "write"]
+__all__ = ["RunDirectory", "append", "write"]

@@ -484,6 +484,8 @@ def test_an_actor_that_gets_no_gradient_is_refused() -> None:
         loss(small_batch())
     with torch.no_grad():
         loss(small_batch())  # to look at
+    loss.actor_network_params.requires_grad_(False)
+    assert loss(small_batch())["loss_synthesis"].requires_grad  # nobody wants to train it: the barrier is
 
 
 def test_region_codes_outside_the_table_are_named() -> None:

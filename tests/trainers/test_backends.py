@@ -108,9 +108,10 @@ def trained(folder: Path, backend: str, workers: int, seed: int = 0) -> dict[str
     experiment = Experiment(compose([*RUN, *words]))
     experiment.run()
     found = json.loads((folder / "metrics.json").read_text())["measurements"]
-    logs = experiment.trainer._log_dict
-    result = {k: float(sum(float(v) for v in logs[k][-2:]) / 2) for k in ("loss_consistency", "dynamics_error")}
-    labels = [float(a) + float(b) for a, b in zip(logs["loss_safe"], logs["loss_unsafe"], strict=True)]
+    rows = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+    rows = [row for row in rows if row["phase"] == "joint"]
+    result = {k: sum(row[k] for row in rows[-2:]) / 2 for k in ("loss_consistency", "dynamics_error")}
+    labels = [row["loss_safe"] + row["loss_unsafe"] for row in rows]
     result |= {"labels": labels[-1], "labels_first": labels[0]}
     return result | {"unsafe": found["unsafe_called_safe"]["value"], "frames": experiment.trainer.collected_frames}
 

@@ -41,6 +41,9 @@ def test_csv_is_the_default_and_keeps_numbers_pictures_and_films(tmp_path, figur
     assert isinstance(logger, CSVLogger)
     log_scalars(logger, {"grad_norm": 2.5, "loss_safe": torch.tensor(1.5)}, step=7)
     assert (tmp_path / "run" / "scalars" / "grad_norm.csv").read_text() == "7,2.5\n"
+    log_scalars(logger, {"grad_norm": 3.0}, step=8)
+    assert (tmp_path / "run" / "scalars" / "grad_norm.csv").read_text() == "7,2.5\n8,3.0\n"
+    assert logger.experiment.scalars["grad_norm"] == [(8, 3.0)]  # in memory and in checkpoints it does not grow
     assert log_figure(logger, "latent", figure, 7).read_bytes()[1:4] == b"PNG"
     written = log_video(logger, "episode", film(), 7)
     close_logger(logger)

@@ -15,8 +15,10 @@ from torchrl_sspl.configs import compose
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.modules.agent import Agent
-from torchrl_sspl.trainers import Check, CheckRound, InnerLoop, Phase, Phases, Workspace, synthesis_phases
-from torchrl_sspl.trainers.synthesis import action_grid
+from torchrl_sspl.modules.choosing import ChoosingPolicy
+from torchrl_sspl.trainers import Check, CheckRound, InnerLoop, Phase, Phases, Workspace, synthesis, synthesis_phases
+from torchrl_sspl.trainers.synthesis import _grid_targets, action_grid
+from torchrl_sspl.viability import viability_kernel
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:init_random_frames")
 
@@ -95,6 +97,56 @@ def test_a_policy_that_is_taught_first_continues_bit_for_bit_too(tmp_path):
     expected = experiment(tmp_path / "whole", value).train()
     killed_after(experiment(tmp_path / "killed", value, EVERY_STEP), 14)
     assert_same(experiment(tmp_path / "killed", value, EVERY_STEP).train(), expected)
+
+
+def test_a_policy_that_chooses_continues_bit_for_bit_too(tmp_path):
+    chooses = ("synthesis.choices=3", "synthesis.gain=0.5", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4")
+    expected = experiment(tmp_path / "whole", *chooses).train()
+    assert isinstance(expected.policy, ChoosingPolicy)
+    assert expected.policy.actions.flatten().tolist() == [-10.0, 0.0, 10.0]
+    killed_after(experiment(tmp_path / "killed", *chooses, EVERY_STEP), 14)
+    assert_same(experiment(tmp_path / "killed", *chooses, EVERY_STEP).train(), expected)
+
+
+def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_path, monkeypatch):
+    """On a line the obstacle lies at |x| < 0.1, and z moves by up to 0.2."""
+    asked = {}
+    monkeypatch.setattr(synthesis, "viability_kernel", lambda *a, **k: asked.update(k) or viability_kernel(*a, **k))
+
+    class Line(nn.Module):
+        latent_dim, action_scale = 1, torch.ones(1)
+
+        def forward(self, latent, action):
+            return (latent + 0.2 * action).clamp(-1, 1)
+
+    work = experiment(tmp_path, "synthesis.choices=2", "synthesis.grid=401", "synthesis.tolerated_error=0.04", "synthesis.guard=0.0").work
+    work.networks["dynamics"] = Line()
+    work.originals["dynamics"], work.taught, work.seen_dim = Line(), lambda z: torch.zeros(len(z), 1), None
+    z = torch.linspace(-1, 1, 401)[:, None]
+    queries = torch.tensor([[0.0], [0.09], [0.13], [0.5], [-0.5]])
+    target, member, action, _ = _grid_targets(work, z, z[:, 0].abs() < 0.1, queries)
+    assert member.tolist() == [False, False, True, True, True]
+    assert target[0] == pytest.approx(0.9 * work.lipschitz_bound * 0.1, abs=0.02)  # distance to what is kept
+    assert target[3] == target[4] == -0.25
+    assert action.shape == (401, 1)
+    assert 0.9 < work.kept_share <= 1.0
+    assert asked["errors"].flatten().tolist() == pytest.approx([-0.05, 0.0, 0.05])  # a quarter more than is to be tolerated
+    assert asked["actions"].tolist() == [[-1.0], [1.0]]
+
+
+def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path):
+    car = ("env=dubins", "network.encoder=BearingEncoder", "network.latent_dim=3", "network.remember_action=true", "synthesis.gain=0.3",
+           "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
+    expected = experiment(tmp_path / "whole", *car).train()
+    killed_after(experiment(tmp_path / "killed", *car, EVERY_STEP), 14)
+    assert_same(experiment(tmp_path / "killed", *car, EVERY_STEP).train(), expected)
+
+
+def test_a_memory_of_actions_needs_an_encoder_that_leaves_room_for_it(tmp_path):
+    with pytest.raises(ConfigError, match="fills 2 of latent_dim=3"):
+        experiment(tmp_path, "network.latent_dim=3", "network.remember_action=true")
+    with pytest.raises(ConfigError, match="BearingEncoder, which fills 2"):
+        experiment(tmp_path, "network.latent_dim=3", "network.encoder=BearingEncoder")
 
 
 def test_inside_the_phases_checkpoints_hold_no_pictures(tmp_path):

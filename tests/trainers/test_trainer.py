@@ -339,6 +339,19 @@ def test_a_signal_between_two_steps_on_a_batch_continues_bit_for_bit(tmp_path: P
     assert logs[0] == logs[1]
 
 
+def test_the_log_holds_the_means_over_the_steps_on_a_batch(tmp_path: Path) -> None:
+    trainer, told = build(tmp_path, batches=3, out_dir=tmp_path), []
+    step = trainer.optimization_stepper.step
+    trainer.optimization_stepper.step = lambda *batch: told.append(step(*batch)) or told[-1].clone()
+    trainer.train()
+    rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert len(told) == 4 * len(rows) == 12
+    assert set(map(len, trainer._log_dict.values())) == {1}  # it does not grow
+    for k, row in enumerate(rows):
+        for name in ("loss_safe", "loss_consistency", "grad_norm"):
+            assert row[name] == pytest.approx(sum(float(t[name]) for t in told[4 * k : 4 * k + 4]) / 4, rel=1e-5), name
+
+
 def test_every_batch_leaves_a_line_in_the_log_and_a_loss_that_is_not_finite_stops(tmp_path: Path) -> None:
     build(out_dir=tmp_path).train()
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]

@@ -11,7 +11,7 @@ from typing import Any
 from torchrl_sspl.errors import ConfigError
 
 BACKENDS = ("sync", "process", "ray")
-PRESETS = ("sound", "paper", "smoke")
+PRESETS = ("sound", "paper", "quick", "smoke")
 _CHOICES = {
     "collector.backend": BACKENDS,
     "network.barrier": ("sandwich", "lmi"),
@@ -45,10 +45,12 @@ class NetworkConfig:
     policy_hidden: list[int] = _option([32, 32], "widths of the policy's hidden layers.")
     encoder: str = _option("FrameEncoder", 'name of an encoder of the library ("FrameEncoder": convolutions, '
         '"MomentEncoder": centres of colours before a background, "ShapeEncoder": place and direction of one thing of one '
-        'colour), or "package.module:Class" of your own, called with '
+        'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves), or "package.module:Class" of your own, called with '
         'those of latent_dim, image_size, pool_to and velocity_gain that it takes.')
     pool_to: int = _option(32, "frames are averaged to this height and width before the first layer, in pixels.")
     velocity_gain: float = _option(4.0, "factor on the difference of the two frames' features.")
+    remember_action: bool = _option(False, "whether the last entries of the latent are the action before, for systems that act "
+        "late; of encoders that leave them to the memory (BearingEncoder).")
 
 
 @dataclass
@@ -168,6 +170,9 @@ class SynthesisConfig:
         "where what is seen there is not worth the networks' capacity (a robot before the obstacle it stands on).")
     tube_radius: float = _option(0.3, "distance from the data up to which a latent off the manifold may belong to the "
         "safe set.")
+    grid: int = _option(0, "nodes per entry that pictures show of a grid over the latent domain, on which the barrier's targets are found "
+        "by dynamic programming, under tolerated_error and with the actions of choices; for latents that the data fill. 0: the targets "
+        "are found on the cloud of the data.")
     tolerated_error: float = _option(0.0, "error per step that the set is meant to be proved to tolerate, latent units: the "
         "invariant set of the data keeps a quarter more, the fine-tuning asks the condition under the worst error of this size, and "
         "then the counterexamples of the proof go back into the training. 0: residual_spread counts, and nothing is asked of the proof.")
@@ -175,6 +180,9 @@ class SynthesisConfig:
     residual_spread: float = _option(1.5, 'standard deviations of the local error that the invariant set of the data '
         'tolerates; with teacher "value" lowered by quarters where nine tenths of S could not be kept otherwise.')
     actions: int = _option(7, "actions per dimension tried at every latent.")
+    choices: int = _option(0, "actions per dimension from which the policy chooses, by the barrier of what they are predicted to "
+        "lead to, where its own would not keep the set; 0: it does not choose.")
+    choice_margin: float = _option(0.02, "barrier value below zero that its own action has to lead to, to be taken.")
     teacher: str = _option("value", 'what teaches the policy before the barrier is fitted: "clearance" (the action '
         'that ends farthest from what lies outside the invariant set, together with the barrier) or "value" (the '
         'action that keeps the largest distance from U on all that follows, before the barrier, which then learns '
@@ -244,8 +252,8 @@ class LoggerConfig:
 class Config:
     """Everything that determines a run; written beside its results."""
 
-    preset: str = _option("sound", '"sound" (what the library stands for), "paper" (losses and schedule as printed) '
-        'or "smoke" (seconds, for tests); a file each.')
+    preset: str = _option("sound", '"sound" (what the library stands for), "paper" (losses and schedule as printed), '
+        '"quick" (a first verdict in minutes) or "smoke" (seconds, for tests); a file each.')
     env: dict[str, Any] = _option(dict, "what is built: an import path ``_target_`` and its arguments.")
     network: NetworkConfig = _option(NetworkConfig, "networks.")
     loss: LossConfig = _option(LossConfig, "the total loss.")

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import contextlib
 import copy
 import functools
 import multiprocessing
 import warnings
+import weakref
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -274,11 +276,21 @@ def make_collector(
         )  # fmt: skip
     copied = copy.deepcopy(policy).cpu()
     if backend == "process":
-        return Collector(
+        collector = Collector(
             makers, copied, backend="process", sync=True, cat_results="stack", auto_register_policy_transforms=False,
             **options,
         )  # fmt: skip
-    return _ray_collector(makers, copied, ray_address, options)
+    else:
+        collector = _ray_collector(makers, copied, ray_address, options)
+    atexit.register(_end, weakref.ref(collector))
+    return collector
+
+
+def _end(collector: weakref.ref[BaseCollector]) -> None:
+    """Ends what a collector has begun that nobody did shut down: its process would wait for the workers for ever."""
+    if (alive := collector()) is not None:
+        with contextlib.suppress(Exception):
+            alive.shutdown()
 
 
 def _ray_collector(makers: list[Any], policy: TensorDictModuleBase, address: str, options: dict[str, Any]) -> BaseCollector:

@@ -229,8 +229,13 @@ class TransitionStore(Storage):
         return state
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore what ``state_dict`` returned, bit for bit; the capacity must suffice."""
-        meta = state_dict["_meta"]
+        """Restore what ``state_dict`` returned, bit for bit; the capacity must suffice.
+
+        Raises CheckpointError, and nothing is changed, for anything that it cannot have returned.
+        """
+        meta: Any = state_dict.get("_meta")
+        if wrong := _wrong(meta, {k: v for k, v in state_dict.items() if k != "_meta"}):
+            raise CheckpointError(f"store: expected what state_dict() returns, found {wrong}; record it again.")
         if meta["len"] > self.max_size:
             raise CheckpointError(f"store: expected at most {self.max_size} transitions, found {meta['len']}.")
         self._empty()
@@ -270,7 +275,10 @@ class TransitionStore(Storage):
     def from_folder(cls, path: str | os.PathLike[str], *, pixel_views: bool = False) -> TransitionStore:
         """A store with the content and the capacity of the one that was saved in a folder."""
         state, meta = _read(Path(path))
-        store = cls(meta["capacity"], pixel_views=pixel_views, keep_state=meta["keep_state"])
+        capacity = meta.get("capacity") if isinstance(meta, dict) else None
+        if type(capacity) is not int or capacity < 1:
+            raise CheckpointError(f"store: expected a capacity >= 1 in {path}, found {capacity!r:.40}; record it again.")
+        store = cls(capacity, pixel_views=pixel_views)
         store.load_state_dict({**state, "_meta": meta})
         return store
 
@@ -336,6 +344,36 @@ def _read(folder: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             f"store: expected a transition store in {folder}, cannot read {file.name} ({error}); "
             "pass the folder that was given to dumps()."
         ) from error
+
+
+def _wrong(meta: Any, columns: dict[str, Any]) -> str:
+    """What of a state no store can have returned; empty where nothing is."""
+    kinds = {"len": int, "cursor": int, "keep_state": bool}
+    if not isinstance(meta, dict) or any(type(meta.get(k)) is not kind for k, kind in kinds.items()):
+        return f"'_meta' {meta!r:.60}"
+    n = meta["len"]
+    if n < 0 or meta["cursor"] < 0:
+        return f"{n} transitions and the cursor at {meta['cursor']}"
+    needed = {"frames", "triple", "action", "region", "next_region", "terminated"} if n else set()
+    needed |= {"state", "next_state"} if n and meta["keep_state"] else set()
+    if lacking := needed - set(columns):
+        return f"no {', '.join(sorted(lacking))}"
+    for name, value in columns.items():
+        if name != "frames" and value.shape[:1] != (n,):
+            return f"'{name}' {tuple(value.shape)} for {n} transitions"
+        if not bool(value.isfinite().all()):
+            return f"numbers in '{name}' that are not finite"
+    if not n:
+        return ""
+    frames, triple = columns["frames"], columns["triple"]
+    if frames.dtype != torch.uint8 or frames.ndim != 4 or frames.shape[1] != 3:
+        return f"frames {frames.dtype} {tuple(frames.shape)}"
+    if triple.dtype != torch.int64 or triple.shape != (n, 3) or int(triple.min()) < 0 or int(triple.max()) >= len(frames):
+        return f"'triple' {triple.dtype} {tuple(triple.shape)} with numbers of other frames than the {len(frames)} there are"
+    for name in ("region", "next_region"):
+        if columns[name].shape != (n, 1) or not set(columns[name].unique().tolist()) <= set(_NAMES):
+            return f"'{name}' {tuple(columns[name].shape)} with codes other than {sorted(_NAMES)}"
+    return ""
 
 
 def _stratified(

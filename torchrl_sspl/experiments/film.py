@@ -15,12 +15,13 @@ from torchrl_sspl.evaluation.controllers import AgentController, Camera, Decisio
 from torchrl_sspl.evaluation.known import barrier_of
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.controller import meets_premise
 from torchrl_sspl.runtime import Shield
+from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.viz.animation import VIEW, Scene, Take
 
-MARGIN = 0.02  # of the filter, for an agent without a proof
 _AFTER = 1.2  # s, for which what went wrong is still looked at
 _COLOURS = {"S": (205, 236, 205), "U": (250, 220, 215), "buffer": (255, 255, 255)}
 _GRID = {2: (61, 61), 3: (25, 25, 13)}  # nodes on which B is computed for its zero level
@@ -68,7 +69,7 @@ class Film:
         if opening.nominal is None:
             takes.append(self._take("the learned policy", opening.start, seed))
         elif isinstance(self.agent, Agent):
-            shield = Shield(self.agent, margin=None if self.agent.tolerated_error > 0.0 else MARGIN)
+            shield = Shield(self.agent, margin=None if self.agent.tolerated_error > 0.0 else UNPROVED_MARGIN)
             takes.append(self._take("behind the safety filter", opening.start, seed, driver=nominal(), shield=shield))
         return Scene(opening.title, takes)
 
@@ -143,7 +144,8 @@ class Film:
         inside = barrier[:n, 0] <= 0.0
         proved = torch.zeros(n, dtype=torch.bool)
         if getattr(self.agent, "held_error", 0.0) > 0.0 and seen is not None:  # every picture so far has to agree
-            proved = (inside & (seen[:n, 0] <= 0.0)).cumprod(0).bool()
+            met = meets_premise(self.agent, barrier[:n, 0], seen[:n, 0], torch.zeros(n))
+            proved = met.cumprod(0).bool()
         return [_PROVED if p else _INSIDE if i else _OUTSIDE for p, i in zip(proved.tolist(), inside.tolist(), strict=True)]
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import contextlib
 import itertools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from torchrl_sspl.certification.certificate import Certificate
-from torchrl_sspl.certification.rounding import down
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.system import Opening
 from torchrl_sspl.errors import CheckpointError
@@ -20,12 +19,13 @@ from torchrl_sspl.evaluation.simulation import Episodes
 from torchrl_sspl.experiments.film import Film, take_of
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.viz.animation import Scene, animate
-from torchrl_sspl.viz.certificate import certificate_section, proved_lines
+from torchrl_sspl.viz.certificate import certificate_section
 from torchrl_sspl.viz.curves import training_curves
 from torchrl_sspl.viz.figures import frames, latent_space, state_plane, trajectories
 from torchrl_sspl.viz.plane import Plane, new_figure
 from torchrl_sspl.viz.report import requirement_rows, write_report
 from torchrl_sspl.viz.slices import slices, walks
+from torchrl_sspl.viz.verdict import first_screen
 
 REPORT_FILE = "report.html"
 _SHOWN = 40  # episodes whose barrier is drawn
@@ -37,6 +37,7 @@ _CAPTION = (
 )
 _ASSUMED = (
     "The environment, its pictures and its resets stay as they were during the evaluation.",
+    "The labels of S and U are right.",
     "Episodes are independent; observations within one are not, and carry no bound.",
 )
 _UNKNOWN = (
@@ -70,7 +71,9 @@ def write_run_report(outcome: Outcome, env: SafetyEnv | None, *, title: str | No
         rows += [(row[0] if own else f"{row[0]} ({name} frames)", *row[1:]) for row in found]
         measurements |= {k if own else f"{name} frames: {k}": m for k, m in evaluation.measurements.items()}
     config = {k: v for k, v in outcome.config.to_dict().items() if k != "out_dir" and v not in (None, {})}
-    certificate = outcome.certificate
+    certificate, lines = outcome.certificate, _proved(outcome)
+    measured = () if rows else outcome.measured()
+    first = first_screen(certificate, rows, trained=outcome.seconds is not None, measured=measured, proved=lines)
     outcome.report = write_report(
         Path(outcome.directory) / REPORT_FILE,
         title=title or ("Safe policy from pixels" if env is None else env.system.title),
@@ -82,10 +85,11 @@ def write_run_report(outcome: Outcome, env: SafetyEnv | None, *, title: str | No
         video=film,
         video_caption=caption,
         notes="\n\n".join(_notes(outcome, env)),
-        headline=_headline(certificate),
-        measured=outcome.measured(),
-        proved=_proved(outcome),
+        headline=(first.headline, first.kind, first.more),
+        measured=first.measured,
+        proved=first.proved,
         assumed=_ASSUMED if env is None else None,
+        kernel=env is not None,
         certificate=None if certificate is None else certificate_section(certificate),
     )
     return figures
@@ -139,16 +143,31 @@ def _of_states(arrays: dict[str, Any], barrier: Any, env: SafetyEnv) -> dict[str
             action_direction=system.action_direction,
             dt=getattr(twin, "dt", None),
             lengths=lengths,
-            caption=f"Episodes that start in {where}" + ("." if lengths is None else ", of the longer half; they end where the space does."),
+            caption=f"Episodes that start in {where}" + ("" if lengths is None else ", of the longer half") + f". {_leaving(twin)}",
         )
     episodes = arrays.get("walks")
     if plane is not None and episodes is not None and episodes.states is not None:
         wrong = torch.stack([happened for name, happened in episodes.events.items() if name != "left"]).any(0)
-        figures["Walks in full physics"] = walks(plane, episodes.states, episodes.alive, wrong)
+        text = f"{len(wrong)} walks in full physics; dots: where they start; red: those that hit, fall or enter U. {_leaving(twin)}"
+        figures["Walks in full physics"] = walks(plane, episodes.states, episodes.alive, wrong, caption=text)
     generator = torch.Generator().manual_seed(0)
     regions = (env.safe_set, env.state_space, env.unsafe_set)
-    figures["What the agent sees"] = frames(env, torch.cat([env.sample_states(2, generator, region=r) for r in regions]))
+    states = torch.cat([env.sample_states(2, generator, region=r) for r in regions])
+    figures["What the agent sees"] = frames(env, states, captions=[_named(system.state_names, s) for s in states.tolist()])
     return figures
+
+
+def _leaving(twin: SafetyEnv) -> str:
+    """What becomes of an episode that leaves the state space."""
+    if twin.exit_region == SAFE:
+        return "An episode that leaves the arena, into the grey, is over and counts as safe."
+    return "Beyond the state space (grey) everything counts as U."
+
+
+def _named(names: Sequence[str], state: Sequence[float]) -> str:
+    """Coordinates of a state with names and units, one below the other."""
+    parts = (name.partition(" [") for name in names)
+    return "\n".join(f"{word} {value:+.2f} {unit.rstrip(']')}" for (word, _, unit), value in zip(parts, state, strict=True))
 
 
 def _plane(twin: SafetyEnv) -> Plane:
@@ -192,7 +211,7 @@ def _of_episodes(arrays: dict[str, Any], barrier: Any) -> dict[str, Any]:
         step, episode = ((episodes.region == UNSAFE) & episodes.alive)[:, :_SHOWN].nonzero(as_tuple=True)
         axes.plot(step, value[step, episode], ".", color="C3", markersize=3)
         axes.axhline(0, color="black", linewidth=1)
-        axes.set(title=name, xlabel="step", ylabel="B")
+        axes.set(title=name, xlabel="time [steps]", ylabel="barrier B [latent units]")
     figures["Barrier along episodes"] = figure
     return figures
 
@@ -251,31 +270,11 @@ def _notes(outcome: Outcome, env: SafetyEnv | None) -> list[str]:
 
 
 def _proved(outcome: Outcome) -> list[str]:
-    """What the certificate proves; without one, what the agent's own proof says."""
-    if outcome.certificate is not None:
-        return proved_lines(outcome.certificate)
+    """The agent's own proof."""
     if not getattr(outcome.agent, "description", {}).get("lipschitz", {}).get("proved"):
         return []
     bound = f"{outcome.agent.lipschitz_bound:g}"
     return [f"The deployed float32 barrier is {bound}-Lipschitz on all of its domain (exact integer arithmetic)."]
-
-
-def _headline(certificate: Certificate | None) -> tuple[str, str]:
-    """What the certificate says, in a line."""
-    if certificate is None:
-        return "Measured, without a certificate", "none"
-    for name in ("deterministic", "statistical"):
-        layer = certificate.layers.get(name)
-        if layer is not None and not layer.holds:
-            return f"{name.capitalize()} layer {layer.verdict}", "bad"
-    covered = certificate.layers.get("run-time")
-    if covered is None:
-        return "Proved, and not measured", "fair"
-    missed = covered["covered"].value
-    if missed is None:
-        return "Proved and measured; the proof applies to no real episode", "fair"
-    reach = f"the proof covers at least {down(100 * (1 - missed), 4)} % of real episodes"
-    return f"Certified: {reach}", "good" if covered.holds else "fair"
 
 
 __all__ = ["REPORT_FILE", "draw_figures", "write_run_report"]

@@ -142,10 +142,17 @@ class Experiment:
                 f"make_env: expected a function (batch_size=[n], seed=...) -> environment, such as partial(GymnasiumPixels, "
                 f"make, safe=..., unsafe=...), received one that raises TypeError: {error}"
             ) from error
+        if not isinstance(env, EnvBase) or env.batch_size != torch.Size([1]):
+            received = f"one of size {list(env.batch_size)}" if isinstance(env, EnvBase) else type(env).__name__
+            raise ConfigError(f"make_env: expected an environment of TorchRL of the batch size asked for, [1], received {received}")
         missing = {"pixels", "region"} - set(env.observation_spec.keys())
         if missing:
             raise ConfigError(f"expected an environment with the keys pixels and region, found no {sorted(missing)}")
-        space = env.action_spec_unbatched.space
+        space: Any = env.action_spec_unbatched.space
+        if not hasattr(space, "low"):
+            raise ConfigError(
+                f"expected actions with bounds, received {type(env.action_spec).__name__}; GymnasiumPixels makes such of discrete ones"
+            )
         self._low, self._high = space.low.cpu().float(), space.high.cpu().float()
         pixels = env.reset()["pixels"].cpu()
         if not isinstance(env, SafetyEnv):
@@ -160,7 +167,13 @@ class Experiment:
             options["image_size"] = self.env.image_size  # type: ignore[assignment]
         given = self._given_encoder
         encoder = build_encoder(net.encoder, **options) if given is None else call_with(given, options)
-        dynamics = LatentDynamics(net.latent_dim, len(scale), net.dynamics_hidden, scale)
+        dynamics = LatentDynamics(net.latent_dim, len(scale), net.dynamics_hidden, scale, net.remember_action)
+        seen = getattr(encoder, "seen_dim", net.latent_dim)
+        if seen != dynamics.moving_dim:
+            raise ConfigError(
+                f"expected an encoder that fills {dynamics.moving_dim} of latent_dim={net.latent_dim} entries with "
+                f"network.remember_action={net.remember_action}, received {type(encoder).__name__}, which fills {seen}"
+            )
         policy = Policy(net.latent_dim, len(scale), net.policy_hidden, scale)
         kind = LMIBarrier if net.barrier == "lmi" else SandwichBarrier
         barrier = kind(net.latent_dim, tuple(net.barrier_hidden), net.lipschitz_bound)
@@ -268,8 +281,7 @@ class Experiment:
     def agent(self) -> Agent:
         """A frozen copy of the present networks, their level placed where the phases have put it."""
         nets = self.encoder, self.dynamics, self.barrier, self.policy
-        options: dict[str, Any] = {"level": self.work.level, "gain": self.work.gain, "description": self.work.description}
-        return Agent.from_networks(*nets, **options)
+        return Agent.from_networks(*nets, level=self.work.level, description=self.work.description, **self.work.acts())
 
     @_alone
     def train(self, *, resume: bool = True) -> Agent:

@@ -17,6 +17,7 @@ from torchrl.data import ReplayBuffer
 from torchrl.trainers import Trainer, TrainerHookBase
 
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.files import append
 from torchrl_sspl.functional import covering_radius, dynamics_error, dynamics_margin, safety_margin
 from torchrl_sspl.objectives import SSPLLoss
 
@@ -220,8 +221,7 @@ class LogHook(_Hook):
                 "with another seed"
             )
         if self.path is not None:
-            with self.path.open("a") as file:
-                file.write(json.dumps({"phase": "joint", "round": 0, "step": step, **row}) + "\n")
+            append(self.path, json.dumps({"phase": "joint", "round": 0, "step": step, **row}))
 
     def state_dict(self) -> dict[str, int]:
         return {"bytes": self.path.stat().st_size if self.path is not None and self.path.is_file() else 0}

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 from torch import Tensor
+from torchrl.record.loggers.csv import CSVLogger
 
 from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, ShapeError
 
@@ -85,6 +86,16 @@ METRICS: Mapping[str, str] = MappingProxyType(
 )
 
 
+class _CSVLogger(CSVLogger):
+    """TorchRL's, which keeps all that it has written in memory and in every checkpoint; this one keeps the newest."""
+
+    def log_scalar(self, name: str, value: float, step: int | None = None) -> None:
+        """Logs a scalar."""
+        super().log_scalar(name, value, step)
+        if step is not None:  # else it is counted by what is kept
+            del self.experiment.scalars[name][:-1]
+
+
 def make_logger(
     kind: str = "csv", name: str = "run", directory: str | Path = "runs", *, project: str = "torchrl-sspl"
 ) -> Any:
@@ -100,9 +111,7 @@ def make_logger(
     if kind == "none":
         return None
     if kind == "csv":
-        from torchrl.record.loggers.csv import CSVLogger
-
-        return CSVLogger(exp_name=name, log_dir=str(directory))
+        return _CSVLogger(exp_name=name, log_dir=str(directory))
     if kind == "tensorboard":
         _need("tensorboard", "tensorboard")
         from torchrl.record.loggers.tensorboard import TensorboardLogger

@@ -17,17 +17,36 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torchrl.trainers import Trainer, TrainerHookBase
-from tqdm import tqdm
 
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.files import append
 from torchrl_sspl.modules.agent import Agent
-from torchrl_sspl.modules.observer import filtered, gain_matrix
+from torchrl_sspl.modules.choosing import ChoosingPolicy
+from torchrl_sspl.modules.observer import completed, filtered, gain_matrix
 from torchrl_sspl.trainers.loggers import METRICS, log_scalars
+from torchrl_sspl.trainers.progress import WORDS, Progress, round_line
 from torchrl_sspl.trainers.source import Source
 
 LOG_FILE = "log.jsonl"
+_MOST_ACTIONS = 729  # in the grid that is tried at every latent
 _PLAIN = ("kept_share", "told", "level", "warnings", "skip")  # of a workspace's state, what JSON can write
+
+
+def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
+    """``(k, m)``, a regular grid of actions up to a scale per dimension, coarser where many would make it too large.
+
+    Raises ConfigError if the action has too many dimensions. Source: none.
+    """
+    m = len(action_scale)
+    k = max(2, min(per_dimension, int(_MOST_ACTIONS ** (1 / m) + 1e-6)))
+    if k**m > 8 * _MOST_ACTIONS:
+        raise ConfigError(
+            f"expected at most {int(math.log2(8 * _MOST_ACTIONS))} action dimensions, received {m}: a grid of actions is "
+            "tried at every latent; set synthesis.enabled=false to keep what the joint training has found"
+        )
+    axes = [torch.linspace(-scale, scale, k) for scale in action_scale]
+    return torch.cartesian_prod(*axes).reshape(-1, m)
 
 
 class InnerLoop:
@@ -48,6 +67,7 @@ class InnerLoop:
         self.step = 0
         self.tick: Callable[[], None] = lambda: None  # after every step
         self.log: Callable[[dict[str, Any]], None] = lambda row: None
+        self.loss: float | None = None  # of the last row in the log, for people
         self._live: tuple[Any, Any] | None = None
         self._saved: dict[str, Any] | None = None
 
@@ -94,13 +114,14 @@ class InnerLoop:
                         f"expected finite losses, received {row} in step {self.step}; lower the learning rate, or resume "
                         "from the last checkpoint with another seed"
                     )
+                self.loss = sum(v for k, v in row.items() if k.startswith("loss"))
                 self.log({"step": self.step, **row})
             self.tick()
         self._live = None
 
     def restart(self) -> None:
         """For the next phase."""
-        self.step, self._live, self._saved = 0, None, None
+        self.step, self._live, self._saved, self.loss = 0, None, None, None
 
     def state_dict(self) -> dict[str, Any]:
         """Step, generators, and the optimiser's state inside a phase."""
@@ -179,7 +200,8 @@ class Workspace:
         self.logger: Any = None  # of TorchRL
         self.logged_step = 0
         self.where: dict[str, Any] = {"phase": "", "round": 0}
-        self.gain = gain_matrix(self.config.gain, self.latent_dim)
+        self.seen_dim: int | None = getattr(self.encoder, "seen_dim", None)
+        self.gain = gain_matrix(self.config.gain, self.latent_dim, self.seen_dim)
         self.latents: dict[str, Tensor] = {}
         self.counterexamples = torch.zeros(0, self.latent_dim)
         self.taught: nn.Module | None = None
@@ -238,14 +260,33 @@ class Workspace:
 
     def filtered(self, part: dict[str, Tensor]) -> dict[str, Tensor]:
         """Transitions of a source, with what the observer makes of them by the present dynamics."""
-        args = (part[k] for k in ("seen", "next_seen", "action", "continues"))
-        latent, after = filtered(self.dynamics, self.gain, *args) if self.observing else (part["seen"], part["next_seen"])
-        return part | {"latent": latent, "next_latent": after}
+        if not self.observing:
+            return part | {"latent": part["seen"], "next_latent": part["next_seen"]}
+        latent, after = filtered(self.dynamics, self.gain, *(part[k] for k in ("seen", "next_seen", "action", "continues")))
+        of_latents = {"seen": latent, "next_seen": after}
+        whole = {k: completed(part[k], known, self.gain) for k, known in of_latents.items()}
+        return part | whole | {"latent": latent, "next_latent": after}
 
     def agent(self, level: float | None = None) -> Agent:
         """A frozen copy of the present networks; {B <= level} becomes {B <= 0}."""
         level, nets = self.level if level is None else level, self.networks.values()
-        return Agent.from_networks(self.encoder, *nets, level=level, gain=self.gain, description=self.description)
+        return Agent.from_networks(self.encoder, *nets, level=level, description=self.description, **self.acts())
+
+    def acts(self) -> dict[str, Any]:
+        """How the agent acts on its latents: the observer's gain, and what the policy chooses from."""
+        s, scale = self.config, self.action_scale
+        choices = action_grid(scale, s.choices) if s.choices else None
+        return {"gain": self.gain, "choices": choices, "choice_margin": s.choice_margin}
+
+    @property
+    def acting(self) -> Any:
+        """What acts on latents: the policy, which chooses where it is told to."""
+        s = self.config
+        if not s.choices:
+            return self.policy
+        choosing = ChoosingPolicy(self.policy, action_grid(self.action_scale, s.choices), s.choice_margin)
+        choosing.bind(self.dynamics, self.barrier)
+        return choosing
 
     def keep(self, rank: Any, number: int, level: float) -> None:
         """Remember the present networks as the best so far."""
@@ -263,8 +304,7 @@ class Workspace:
     def log(self, row: dict[str, Any]) -> None:
         """Append a line to ``log.jsonl``, and give its numbers to the logger."""
         if self.out_dir is not None:
-            with (self.out_dir / LOG_FILE).open("a") as file:
-                file.write(json.dumps({**self.where, **row}) + "\n")
+            append(self.out_dir / LOG_FILE, json.dumps({**self.where, **row}))
         log_scalars(self.logger, {k: v for k, v in row.items() if k in METRICS}, self.logged_step)
 
     def log_once(self, row: dict[str, Any]) -> None:
@@ -384,28 +424,43 @@ class Phases(TrainerHookBase):
         work.loop.tick = self._tick
         own_bar = self.bar is None
         if own_bar:
-            self.bar = tqdm(total=self.steps, initial=self.steps_done, unit="step", disable=not self.progress)
+            self.bar = Progress(self.steps, self.steps_done, shown=self.progress)
         before = self.bar.n - self.steps_done
-        rounds = len({phase.number for phase in self.phases}) > 1
+        rounds = 1 + max(phase.number for phase in self.phases)
         while not self.finished:
             phase = self.phases[self.done]
             work.where = {"phase": phase.name, "round": phase.number}
             work.logged_step = base + self.steps_done
-            self.bar.set_description(f"{phase.name} {phase.number}" if rounds else phase.name)
+            self._show(phase, rounds)
             if not work.skip:
                 phase.run(work)
             work.loop.restart()
             self.done += 1
-            self.bar.n = before + self.steps_done
-            self.bar.refresh()
+            self.bar.move(before + self.steps_done)
+            self._tell(phase)
             if self.finished:
                 work.finish()
             self._save(force_save=True)  # what comes next may take long and have no steps
         if own_bar:
             self.bar.close()
 
+    def _show(self, phase: Phase, rounds: int) -> None:
+        """Which phase it is, in words."""
+        words = WORDS.get(phase.name, phase.name)
+        words = f"round {phase.number + 1} of {rounds}: {words}" if rounds > 1 else words
+        self.bar.begin(words, phase.size(self.work), taken=self.work.loop.step, left=len(self.phases) - self.done - 1)
+
+    def _tell(self, phase: Phase) -> None:
+        """What came out of a phase, as far as people want to know."""
+        work = self.work
+        if phase.name == "check" and work.checks:
+            self.bar.say(round_line(work.checks[-1], work.config.check_episodes))
+            self.bar.kept = max([c.size for c in work.checks if c.passed], default=0.0)
+        elif phase.name == "level" and not work.skip:
+            self.bar.say(f"zero level placed at {work.level:.3g}, between held-out observations of U and S")
+
     def _tick(self) -> None:
-        self.bar.update()
+        self.bar.tick(lambda: self.work.loop.loss)
         self.work.logged_step += 1
         self._save()
 

@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.evaluation.certify import premise
-from torchrl_sspl.evaluation.controllers import AgentController, RandomController
+from torchrl_sspl.evaluation.controllers import AgentController, RandomController, covered
 from torchrl_sspl.evaluation.episodes import separating_level
 from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.modules.agent import Agent
-from torchrl_sspl.modules.controller import meets_premise
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.trainers.phases import Check, Phase, Workspace
@@ -102,9 +101,7 @@ class CheckRound(Phase):
     def _covered(run: Episodes, agent: Agent) -> float:
         """Share of the episodes from the set that meet the premise of the proof at every step."""
         assert run.barrier is not None
-        error = torch.cat([torch.zeros_like(run.prediction_error[:1]), run.prediction_error])  # nothing was expected at first
-        met = meets_premise(agent, run.barrier, run.seen, error)
-        return float(met.all(0)[run.barrier[0] <= 0].float().mean())
+        return float(covered(run, agent)[run.barrier[0] <= 0].float().mean())
 
     def _held_out(self, work: Workspace, agent: Agent) -> _HeldOut | None:
         s, source = work.config, work.source
@@ -114,7 +111,8 @@ class CheckRound(Phase):
         def values(states: Tensor) -> Tensor:
             return agent.barrier(encode_states(agent, env, states))[:, 0]
 
-        unsafe = values(env.sample_states(min(8 * n, _UNSAFE_DRAWS), generator, region=env.unsafe_set))
+        in_unsafe = env.sample_states(min(8 * n, _UNSAFE_DRAWS), generator, region=env.unsafe_set)
+        unsafe = agent.least_barrier(encode_states(agent, env, in_unsafe))
         safe = values(env.sample_states(n, generator, region=env.safe_set))
         states = env.sample_states(3 * n, generator, region=source.outside_unsafe)
         anywhere = values(states)

@@ -81,8 +81,13 @@ class SSPLStepper(OptimizationStepper):
         self.begin_batch()
 
     def begin_batch(self) -> None:
-        """Steps on what was collected last, and the mean of their terms, begin at zero."""
-        self.inside, self.mean = 0, {}  # type: tuple[int, dict[str, Tensor]]
+        """Steps on what was collected last, and the sums of their terms, begin at zero."""
+        self.inside, self.sums = 0, {}  # type: tuple[int, dict[str, Tensor]]
+
+    @property
+    def mean(self) -> dict[str, Tensor]:
+        """The terms, averaged over the steps on what was collected last."""
+        return {key: value / self.inside for key, value in self.sums.items()}
 
     @property
     def blind(self) -> bool:
@@ -116,8 +121,7 @@ class SSPLStepper(OptimizationStepper):
             self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
         extra = {"grad_norm": norm.detach(), "warm_start": torch.tensor(float(warm)), **self._lipschitz_step()}
         told = {**dict(terms.detach().items()), **extra}
-        n = self.inside
-        self.mean = {key: (self.mean[key] * n + value) / (n + 1) if n else value for key, value in told.items()}
+        self.sums = {key: self.sums[key] + value if self.sums else value for key, value in told.items()}
         self.inside += 1
         return TensorDict(told, batch_size=[])
 
@@ -154,9 +158,9 @@ class SSPLStepper(OptimizationStepper):
         return {**dict(terms.detach().items()), "lipschitz_share": torch.tensor(share)}
 
     def state_dict(self) -> dict[str, Any]:
-        """Counters, progress of the warm start, mean of the terms, and both optimisers."""
+        """Counters, progress of the warm start, sums of the terms, and both optimisers."""
         state: dict[str, Any] = {"count": self.count, "mislabelled": self.mislabelled, "optimizer": self.optimizer.state_dict()}
-        state |= {"inside": self.inside, "mean": dict(self.mean)}
+        state |= {"inside": self.inside, "sums": dict(self.sums)}
         if self.lipschitz_optimizer is not None:
             state["lipschitz_optimizer"] = self.lipschitz_optimizer.state_dict()
         return state
@@ -164,7 +168,7 @@ class SSPLStepper(OptimizationStepper):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
         self.count, self.mislabelled = int(state_dict["count"]), float(state_dict["mislabelled"])
-        self.inside, self.mean = int(state_dict.get("inside", 0)), dict(state_dict.get("mean", {}))
+        self.inside, self.sums = int(state_dict.get("inside", 0)), dict(state_dict.get("sums", {}))
         self.optimizer.load_state_dict(state_dict["optimizer"])
         if self.lipschitz_optimizer is not None:
             self.lipschitz_optimizer.load_state_dict(state_dict["lipschitz_optimizer"])

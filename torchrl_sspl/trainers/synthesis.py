@@ -10,8 +10,7 @@ and policy onto the largest robust invariant set of the cloud of latents (or the
 from __future__ import annotations
 
 import copy
-import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -20,13 +19,13 @@ from torch import Tensor, nn
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.configs.schema import SynthesisConfig
-from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.modules.observer import corrected
+from torchrl_sspl.modules.observer import corrected, gain_matrix
 from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
-from torchrl_sspl.trainers.phases import Phase, Workspace
+from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
+from torchrl_sspl.viability import viability_kernel
 from torchrl_sspl.viability.cloud import (
     barrier_targets,
     nearby_residuals,
@@ -43,11 +42,12 @@ _KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not lo
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
 _SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerated, the first that keeps S
 _KEPT_OF_SAFE = 0.9
-_MOST_ACTIONS = 729  # in the grid that is tried at every latent
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data tolerates
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
 _WEIGHT = 2.0  # of counterexamples
+_MEMORY = 17  # nodes of the grid per entry that no picture shows
+_DEPTH = 0.25  # barrier value up to which the targets on a grid go
 _POOL = 8192  # counterexamples that are kept
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
@@ -76,7 +76,7 @@ class Gather(Phase):
             if missing > 0 and (source.known or stored is None):
                 parts.append(source.random(missing, 0))
             if work.observing and source.known:
-                parts.append(self._rollouts(work, 15, torch.eye(work.latent_dim)))
+                parts.append(self._rollouts(work, 15, gain_matrix(1.0, work.latent_dim, work.seen_dim)))
         else:
             parts = [work.latents, self._near_the_set(work)]
             if source.known and s.rim_transitions:
@@ -114,7 +114,7 @@ class Gather(Phase):
         s, source = work.config, work.source
         region = source.outside_unsafe if source.known else None
         memory: dict[str, Any] = {"dynamics": work.dynamics, "gain": gain} if work.observing else {}
-        return source.under(work.policy, s.rollout_transitions, index, exploration=s.exploration, region=region, **memory)
+        return source.under(work.acting, s.rollout_transitions, index, exploration=s.exploration, region=region, **memory)
 
 
 @torch.no_grad()
@@ -290,7 +290,7 @@ class FineTune(_Training):
     def _losses(self, work: Workspace) -> tuple[SynthesisLoss, TargetLoss]:
         s = work.config
         condition = SynthesisLoss(
-            None, work.dynamics, work.barrier, work.policy, mode="R3", dynamics_margin=self.margin(s), band=s.band,
+            None, work.dynamics, work.barrier, work.acting, mode="R3", dynamics_margin=self.margin(s), band=s.band,
             worst_coeff=1.0, worst_fraction=0.02, off_manifold_coeff=1.0,
         )  # fmt: skip
         target = TargetLoss(
@@ -304,7 +304,7 @@ class FineTune(_Training):
         """Adds latents of the whole domain at which the condition fails; they are searched for again and again."""
         s, step = work.config, work.loop.step
         if step % _SEARCH_EVERY == 0:
-            nets = work.barrier, work.dynamics, work.policy
+            nets = work.barrier, work.dynamics, work.acting
             system = closed_loop(*nets, latent_dim=work.latent_dim, lipschitz_bound=work.lipschitz_bound)
             found = find_counterexamples(system, s.counterexamples, margin=s.margin, generator=work.loop.generator)
             known = found if step == 0 else torch.cat([found, work.counterexamples])
@@ -344,7 +344,7 @@ class Tighten(FineTune):
         if work.loop.step == 0:
             work.counterexamples = torch.zeros(0, work.latent_dim)
         self._loss = CounterexampleLoss(
-            work.dynamics, work.barrier, work.policy, dynamics_margin=_SPARE, error=work.config.tolerated_error,
+            work.dynamics, work.barrier, work.acting, dynamics_margin=_SPARE, error=work.config.tolerated_error,
             worst_coeff=0.3, worst_fraction=0.02,
         )  # fmt: skip
         super().run(work)
@@ -363,14 +363,14 @@ class Tighten(FineTune):
         """The worst latents of the set, up to as many as are kept; those that are nearly counterexamples count, too."""
         g, p, old = work.loop.generator, work.latent_dim, work.counterexamples
         near = rim[work.loop.pick(len(rim), samples)] + 0.04 * torch.randn(samples, p, generator=g)
-        points = [near, torch.rand(samples, p, generator=g) * 2 - 1]
+        points = [near, uniform(work, samples, g)]
         if len(old):
             points += [old, old[work.loop.pick(len(old), samples // 2)] + 0.01 * torch.randn(samples // 2, p, generator=g)]
         z = torch.cat(points).clamp(-1, 1)
         z = z[work.barrier(z)[:, 0] <= 0.02]
         if not len(z):
             return z
-        after, error = work.dynamics(z, work.policy(z)), work.config.tolerated_error
+        after, error = work.dynamics(z, work.acting(z)), work.config.tolerated_error
         possible = work.barrier(after)[:, 0] + work.lipschitz_bound * error + _SPARE > -0.01
         z, after = z[possible], after[possible]
         value = work.barrier(after + worst_error(work.barrier, after, error))[:, 0] + _SPARE
@@ -407,22 +407,6 @@ def _pieces(continues: Tensor) -> Tensor:
     return torch.where(piece < ends[:, None], piece, -1)
 
 
-def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
-    """``(k, m)``, a regular grid of actions up to a scale per dimension, coarser where many would make it too large.
-
-    Raises ConfigError if the action has too many dimensions. Source: none.
-    """
-    m = len(action_scale)
-    k = max(2, min(per_dimension, int(_MOST_ACTIONS ** (1 / m) + 1e-6)))
-    if k**m > 8 * _MOST_ACTIONS:
-        raise ConfigError(
-            f"expected at most {int(math.log2(8 * _MOST_ACTIONS))} action dimensions, received {m}: a grid of actions is "
-            "tried at every latent; set synthesis.enabled=false to keep what the joint training has found"
-        )
-    axes = [torch.linspace(-scale, scale, k) for scale in action_scale]
-    return torch.cartesian_prod(*axes).reshape(-1, m)
-
-
 @torch.no_grad()
 def off_manifold(work: Workspace, latent: Tensor, radius: float, salt: int) -> tuple[Tensor, Tensor]:
     """Latents moved off the data manifold along its normals, and the rows that they came from."""
@@ -437,6 +421,26 @@ def off_manifold(work: Workspace, latent: Tensor, radius: float, salt: int) -> t
     kept = (length[:, 0] > 1e-3) & (nearest_distance(points, cloud) > 0.85 * moved[:, 0])
     rows = kept.nonzero()[:, 0]
     return points[rows], rows
+
+
+def uniform(work: Workspace, n: int, generator: torch.Generator) -> Tensor:
+    """``(n, p)`` latents of the whole domain."""
+    z = torch.rand(n, work.latent_dim, generator=generator) * 2 - 1
+    return z if work.seen_dim is None else remembered(work, z, generator)
+
+
+def remembered(work: Workspace, latent: Tensor, generator: torch.Generator) -> Tensor:
+    """Latents ``(n, p)`` with other actions in their memory: anywhere in the domain, or from what the policy chooses from.
+
+    What is chosen lies on the rim of the domain, which is never drawn uniformly.
+    """
+    seen, n = work.seen_dim or work.latent_dim, len(latent)
+    hidden = torch.rand(n, work.latent_dim - seen, generator=generator) * 2 - 1
+    if work.config.choices:
+        table = action_grid([1.0] * hidden.shape[1], work.config.choices)
+        drawn = table[torch.randint(len(table), (n,), generator=generator)]
+        hidden = torch.where(torch.rand(n, 1, generator=generator) < 0.5, drawn, hidden)
+    return torch.cat([latent[:, :seen], hidden], -1)
 
 
 def _cloud(work: Workspace, generator: torch.Generator) -> Tensor:
@@ -476,17 +480,22 @@ def targets(work: Workspace, number: int) -> tuple[TensorDict, TensorDict]:
     if "targets" not in work.cache:
         s, data = work.config, work.latents
         g = torch.Generator().manual_seed(work.seed + 88_000 + number)
-        z, unsafe = data["latent"], work.unsafe()
+        z, region = data["latent"], data["region"]
+        if work.seen_dim is not None:  # a label is about a picture, whatever the memory holds beside it
+            z, region = torch.cat([z, remembered(work, z, g)]), torch.cat([region, region])
+        unsafe = region[:, 0] == UNSAFE
         zc = z[~unsafe]
         near, axes = observed_errors(work, zc, g, s.residual_spread)
-        stray = torch.rand(60000, z.shape[1], generator=g) * 2 - 1
+        stray = uniform(work, 60000, g)
         tube, _ = off_manifold(work, z, 2 * s.tube_radius, 1000 + number)
         rim, rows = off_manifold(work, zc, 1.2 * s.tube_radius, 2000 + number)
         queries = torch.cat([z, data["next_latent"], tube, stray])
-        if s.teacher == "value":
-            target, member, best, weight = _value_targets(work, queries, axes)
+        if s.grid:
+            target, member, best, weight = _grid_targets(work, z, unsafe, queries)
+        elif s.teacher == "value":
+            target, member, best, weight = _value_targets(work, z, region, queries, axes)
         else:
-            target, member, best, weight = _clearance_targets(work, queries, stray, axes, g)
+            target, member, best, weight = _clearance_targets(work, z, unsafe, queries, stray, axes, g)
         rest = len(queries) - len(z)
         table = TensorDict(
             latent=queries,
@@ -494,7 +503,7 @@ def targets(work: Workspace, number: int) -> tuple[TensorDict, TensorDict]:
             inside=member[:, None],
             action_target=torch.cat([best, torch.zeros(rest, best.shape[1])]),
             action_weight=torch.cat([weight, torch.zeros(rest)])[:, None],
-            region=torch.cat([data["region"], torch.zeros(rest, 1, dtype=torch.int64)]),
+            region=torch.cat([region, torch.zeros(rest, 1, dtype=torch.int64)]),
             batch_size=[len(queries)],
         )
         asked = TensorDict(
@@ -505,10 +514,10 @@ def targets(work: Workspace, number: int) -> tuple[TensorDict, TensorDict]:
 
 
 def _clearance_targets(
-    work: Workspace, queries: Tensor, stray: Tensor, errors: Tensor, generator: torch.Generator
+    work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor, stray: Tensor, errors: Tensor, generator: torch.Generator
 ) -> tuple[Tensor, ...]:
     """Signed distance to the robust invariant set; actions that keep the largest clearance, or lead back soonest."""
-    s, z, unsafe = work.config, work.latents["latent"], work.unsafe()
+    s = work.config
     zc, actions = z[~unsafe], action_grid(work.action_scale, s.actions)
     found = robust_invariant_set(successors(work, zc, actions), zc, z[unsafe], residuals=errors)
     kept = found.inside
@@ -535,19 +544,45 @@ def _clearance_targets(
 
 
 @torch.no_grad()
-def _value_targets(work: Workspace, queries: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
-    """Minus the margin that the taught policy keeps, and the taught policy itself."""
-    s, data = work.config, work.latents
-    taught = work.taught or work.policy
-    z, unsafe, safe = data["latent"], work.unsafe(), data["region"][:, 0] == SAFE
+def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -> tuple[Tensor, ...]:
+    """Signed distance to what some action of the table keeps, whatever error is added, on a grid over the latent domain; and the
+    taught policy."""
+    s, p, taught = work.config, work.latent_dim, work.taught or work.policy
+    seen = work.seen_dim or p
+    looks_unsafe, room = z[unsafe][:, :seen], max(s.guard, 1.0 / (s.grid - 1))  # at least half of a cell
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * seen).reshape(-1, seen)
+    length = signs.norm(dim=1, keepdim=True).clamp_min(1.0)
+    errors = torch.nn.functional.pad(_ROOM * s.tolerated_error * signs / length, (0, p - seen))
+    found = viability_kernel(
+        work.dynamics, low=[-1.0] * p, high=[1.0] * p, resolution=[s.grid] * seen + [_MEMORY] * (p - seen), errors=errors,
+        margin=lambda x: nearest_distance(x[:, :seen], looks_unsafe) - room, actions=action_grid(work.action_scale, s.choices or s.actions),
+        exit_is_safe=False,
+    )  # fmt: skip
+    nodes, inside = found.grid.nodes(), found.value.flatten() > 0.0
+    if not bool(inside.any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
+        inside = found.margin.flatten() > 0.0
+    distance = nearest_distance(queries, nodes[inside]) - nearest_distance(queries, nodes[~inside])
+    target = (0.9 * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
+    work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
+    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
+    return target, target <= 0.0, taught(z), torch.ones(len(z))
+
+
+@torch.no_grad()
+def _value_targets(work: Workspace, z: Tensor, region: Tensor, queries: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
+    """Minus the margin that the taught policy keeps, or the best of the actions to choose from; and the taught policy itself."""
+    s, taught = work.config, work.taught or work.policy
+    unsafe, safe = region[:, 0] == UNSAFE, region[:, 0] == SAFE
     action = taught(z)
     margin = signed_margin(z, unsafe)
     following, mean = work.dynamics(z, action)[:, None], errors[:, :1]
+    if s.choices:
+        following = successors(work, z, action_grid(work.action_scale, s.choices))
     for share in _SPREADS:
         # What looks unsafe ends there, whatever follows: no errors are needed for it.
         around = torch.zeros(len(z), *errors.shape[1:])
         around[~unsafe] = torch.lerp(mean, errors, share)
-        value = safety_values(following, z, margin, residuals=around)[:, 0].minimum(margin)
+        value = safety_values(following, z, margin, residuals=around).amax(1).minimum(margin)
         # A set without S is worth nothing: rather tolerate less.
         if int((value[safe] > 0).sum()) >= _KEPT_OF_SAFE * int(safe.sum()):
             break

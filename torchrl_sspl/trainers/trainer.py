@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import json
+import math
 import os
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from functools import partial
@@ -17,7 +20,6 @@ from torchrl.checkpoint import Checkpoint, CheckpointRotation, GlobalRNGState
 from torchrl.data import ReplayBuffer
 from torchrl.objectives import SoftUpdate, TargetNetUpdater
 from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer, UpdateWeights
-from tqdm import tqdm
 
 from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError
 from torchrl_sspl.interrupts import end_if_pending, interruptible, pending, saving
@@ -26,6 +28,7 @@ from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
 from torchrl_sspl.trainers.hooks import ClockHook, EveryHook, FitEncoderHook, LogHook, MarginHook, SeedHook
 from torchrl_sspl.trainers.loggers import log_figure
 from torchrl_sspl.trainers.phases import LOG_FILE, Phases
+from torchrl_sspl.trainers.progress import Progress
 from torchrl_sspl.trainers.stepper import SSPLStepper
 
 Call = Callable[["SSPLTrainer"], Mapping[str, Any]]
@@ -38,6 +41,19 @@ class _RNGState(GlobalRNGState):
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         lacking = set() if torch.cuda.is_available() else {"torch_cuda"}
         super().load_state_dict({k: v for k, v in state_dict.items() if k not in lacking})
+
+
+def _check_sizes(checkpoint: Path) -> None:
+    """A ValueError for a file that is not as long as its tensor: upstream fills it up with zeros, and goes on with them."""
+    for about in checkpoint.rglob("meta.json"):
+        for name, value in json.loads(about.read_text()).items():
+            if isinstance(value, dict) and "dtype" in value:
+                size = math.prod(value["shape"]) * getattr(torch, value["dtype"].removeprefix("torch.")).itemsize
+                if not size:  # an empty tensor has no file
+                    continue
+                found = (about.parent / f"{name}.memmap").stat().st_size
+                if found != size:
+                    raise ValueError(f"{found} bytes in place of {size} in {about.parent.relative_to(checkpoint) / name}.memmap")
 
 
 class SSPLTrainer(Trainer):
@@ -149,7 +165,9 @@ class SSPLTrainer(Trainer):
             optim_steps_per_batch=optim_steps_per_batch, optimization_stepper=stepper, replay_buffer=replay_buffer,
             target_net_updater=target_net_updater, progress_bar=False, **trainer_options,
         )  # fmt: skip
+        self._log_dict: Any = defaultdict(partial(deque, maxlen=1))  # else all that was ever logged
         self.phases, self.clock, self.show_progress, self.resumed = phases, ClockHook(), progress_bar, False
+        self._bar, self._joint = Progress(0, 0, shown=False), False
         self._register(replay_buffer, margins, rollout_policy, None if out_dir is None else Path(out_dir) / LOG_FILE)
         if evaluate is not None:
             EveryHook(self, evaluate, every=evaluate_every).register(self, "evaluate")
@@ -214,11 +232,13 @@ class SSPLTrainer(Trainer):
 
     def _train(self) -> None:
         self.clock.start()
-        self._bar = tqdm(
-            total=self._joint_steps() + (0 if self.phases is None else self.phases.steps), unit="step",
-            initial=self._optim_count + (0 if self.phases is None else self.phases.steps_done),
-            disable=not self.show_progress, desc="joint", postfix="resumed" if self.resumed else None,
+        self._bar = Progress(
+            self._joint_steps() + (0 if self.phases is None else self.phases.steps),
+            self._optim_count + (0 if self.phases is None else self.phases.steps_done),
+            shown=self.show_progress, resumed=self.resumed,
         )  # fmt: skip
+        self._bar.begin("collecting pictures", 0)
+        self._joint = False
         if self.phases is not None:
             self.phases.bar = self._bar
         try:
@@ -249,7 +269,7 @@ class SSPLTrainer(Trainer):
         """The steps on what was collected, or those that are missing; a checkpoint may lie between any two of them."""
         stepper = self.optimization_stepper
         whole = int(self.optim_steps_per_batch)  # type: ignore[has-type]
-        self._last_step, self.optim_steps_per_batch = whole * self.num_epochs, whole - stepper.inside
+        self._last_step, self.optim_steps_per_batch = whole, whole - stepper.inside
         try:
             super().optim_steps(batch)
         finally:
@@ -283,7 +303,15 @@ class SSPLTrainer(Trainer):
         return max(1, -(-self.total_frames // frames) - max(before, 1) + 1) * int(self.optim_steps_per_batch or 1)
 
     def _tick(self) -> None:
-        self._bar.update()
+        if not self._joint:
+            self._joint, left = True, 0 if self.phases is None else len(self.phases.phases)
+            self._bar.begin("joint training", self._joint_steps(), taken=self._optim_count, left=left)
+        self._bar.tick(self._loss)
+
+    def _loss(self) -> float | None:
+        """Mean total of the steps on the batch that was collected last."""
+        mean = self.optimization_stepper.mean
+        return float(sum(v for k, v in mean.items() if k.startswith("loss_"))) if mean else None
 
     @staticmethod
     def _draw(draw: Call, trainer: SSPLTrainer) -> dict[str, Any]:
@@ -333,6 +361,7 @@ class SSPLTrainer(Trainer):
             return False
         try:
             checkpoint = self._sync_checkpoint_components()
+            _check_sizes(latest)
             there = set(Checkpoint.manifest(latest)["components"])
             names = [name for name in checkpoint.components if name in there or name not in _PICTURES]
             checkpoint.load(latest, components=names, map_location="cpu")

@@ -1,0 +1,87 @@
+"""What is shown while a training runs: words, loss, volume, and a time that is measured in the phase it is about."""
+
+from __future__ import annotations
+
+import io
+from types import SimpleNamespace
+
+import pytest
+
+from torchrl_sspl.trainers import progress as module
+from torchrl_sspl.trainers.phases import Check, Phase, Phases
+from torchrl_sspl.trainers.progress import WORDS, Progress, round_line
+from torchrl_sspl.trainers.synthesis import synthesis_phases
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    now = SimpleNamespace(seconds=100.0)
+    monkeypatch.setattr(module.time, "monotonic", lambda: now.seconds)
+    return now
+
+
+def test_the_time_left_is_that_of_the_present_phase_by_its_own_pace(clock):
+    bar = Progress(2000, 0, file=io.StringIO())
+    bar.begin("joint training", 100, left=3)
+    assert bar.eta() == "3 phases follow"  # nothing is known yet
+    for _ in range(10):
+        clock.seconds += 6.0
+        bar.tick(lambda: 0.25)
+    assert bar.eta() == "9 min left of this phase, then 3 more"
+    bar.begin("fitting", 1000, taken=500, left=0)  # slow steps before say nothing of these
+    assert bar.eta() == ""
+    for _ in range(100):
+        clock.seconds += 0.1
+        bar.tick(lambda: None)
+    assert bar.eta() == "40 s left of this phase"
+
+
+def test_phase_loss_and_volume_are_in_the_bar_and_the_loss_is_asked_for_once_a_second(clock):
+    file, asked = io.StringIO(), []
+    bar = Progress(100, 0, file=file)
+    bar.begin("joint training", 100)
+    bar.kept = 0.62
+    for _ in range(40):
+        clock.seconds += 0.1
+        bar.tick(lambda: asked.append(1) or 0.125)
+    shown = file.getvalue()
+    for words in ("joint training", "loss 0.125", "safe set 62 % of what is not U".replace(" %", "%"), "left of this phase"):
+        assert words in shown
+    assert 3 <= len(asked) <= 5
+
+
+def test_what_is_not_shown_asks_for_nothing():
+    bar = Progress(10, 0, shown=False)
+    bar.begin("a", 10)
+    bar.tick(lambda: pytest.fail("a loss was asked for"))
+    bar.say("nothing")
+    bar.move(7)
+    assert bar.n == 7
+
+
+def test_every_round_ends_with_a_sentence(capsys):
+    found = Check(0, 0.0, 0, 0, 2, 0, 0.98, 0.62, True, "")
+
+    class Checked(Phase):
+        name = "check"
+
+        def run(self, work):
+            work.checks.append(found)
+
+    loop = SimpleNamespace(step=0, restart=lambda: None, loss=None)
+    work = SimpleNamespace(
+        checks=[], config=SimpleNamespace(check_episodes=4000), loop=loop, skip=False, begin=lambda: None, finish=lambda: None
+    )
+    Phases([Checked(0)], work, progress=True).run()
+    said = "".join(capsys.readouterr())
+    assert "round 1: the safe set holds 62 % of what is not U; of up to 4,000 held-out episodes 2 left it, 0 met U" in said
+    refused = Check(1, 0.0, 3, 0, 0, 0, 0.0, 0.4, False, "unsafe inside 3")
+    assert round_line(refused, 10).endswith("not kept, because of: unsafe inside 3")
+    assert "no safe set" in round_line(Check(1, 0.0, 0, 0, 0, 0, 0.0, 0.0, False, "the set is empty"), 10)
+
+
+def test_every_phase_has_words():
+    from torchrl_sspl.configs.schema import SynthesisConfig
+
+    for settings in (SynthesisConfig(), SynthesisConfig(teacher="clearance", tolerated_error=0.1)):
+        assert {phase.name for phase in synthesis_phases(settings)} <= set(WORDS)
