@@ -317,14 +317,19 @@ def _with_poster(images: Iterator[np.ndarray], path: Path, fps: int) -> Iterator
         require("PIL.Image").fromarray(poster).save(path, quality=88)
 
 
-def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
-    ffmpeg = require("imageio_ffmpeg")
-    first = next(images)
+def mp4_writer(path: Path, size: tuple[int, int], fps: float, preset: str) -> Any:
+    """What RGB pictures ``(height, width, 3)`` of a film are sent to; ``size``: width and height, ``preset``: of the codec."""
     # Small, and ready to play before it is read to the end.
-    output = ["-crf", "24", "-preset", "medium", "-movflags", "+faststart", "-threads", "1"]
+    output = ["-crf", "24", "-preset", preset, "-movflags", "+faststart", "-threads", "1"]
     style = {"codec": "libx264", "quality": None, "macro_block_size": 2, "output_params": output}
-    writer = ffmpeg.write_frames(str(path), (first.shape[1], first.shape[0]), fps=fps, **style)
+    writer = require("imageio_ffmpeg").write_frames(str(path), size, fps=fps, **style)
     writer.send(None)
+    return writer
+
+
+def _write_mp4(path: Path, images: Iterator[np.ndarray], fps: int) -> None:
+    first = next(images)
+    writer = mp4_writer(path, (first.shape[1], first.shape[0]), fps, preset="medium")
     try:
         for image in itertools.chain([first], images):
             writer.send(np.ascontiguousarray(image))

@@ -41,24 +41,6 @@ def certificate_section(certificate: Certificate) -> str:
     return "".join(parts) + "</section>"
 
 
-def proved_lines(certificate: Certificate) -> list[str]:
-    """The proved statements as sentences, for the head of the report. Source: none.
-
-    Example:
-        >>> from torchrl_sspl.certification import Layer
-        >>> layer = Layer("deterministic", [Statement("a", "1 < 2", PROVED, True)])
-        >>> proved_lines(Certificate("demo", "", "", 0.0, {"deterministic": layer}))
-        ['1 < 2.']
-    """
-    lines = []
-    for layer in certificate.layers.values():
-        for s in layer.statements:
-            if s.kind == PROVED and s.holds:
-                value = "" if s.value is None or not s.unit else f" ({shown(s)})"
-                lines.append(s.text + value + ".")
-    return lines
-
-
 def _row(statement: Statement) -> list[str]:
     s = statement
     if not s.decides:

@@ -16,7 +16,7 @@ from torchrl_sspl.configs.reader import EnvFactory
 from torchrl_sspl.envs.system import Requirement
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.viz.curves import read_log
-from torchrl_sspl.viz.report import badge, file_uri, format_value, table, verdict_in, write_page
+from torchrl_sspl.viz.report import badge, bounded, file_uri, format_value, table, verdict_in, write_page
 
 _COLOURS = ("#2166ac", "#b2182b", "#1b7837", "#b35806", "#762a83", "#01665e", "#c51b7d", "#4d4d4d")
 _OWN = ("out_dir", "seed", "trainer.progress", "logger.kind", "logger.project")  # no settings of what is compared
@@ -133,6 +133,8 @@ def _row(
     worst = (max if required.sense == "<=" else min)(known, default=None)
     asked = worst if len(known) == len(values) else None
     verdict = required.verdict(SimpleNamespace(measurements={name: SimpleNamespace(value=asked)}))
+    for m in found:  # of equal values the least certain counts
+        verdict = bounded(required, verdict, SimpleNamespace(**{k: m.get(k) for k in ("lower", "upper")}))
     must, label = f"{required.sense} {format_value(required.must, unit)}", required.label + shown
     return Row(setting, evaluation, name, label, unit, must, mean, worst, values, verdict_in(unit, verdict))
 

@@ -93,7 +93,8 @@ def _draw_losses(ax: Axes, rows: list[dict[str, Any]]) -> None:
             ax.set_yscale("log")
         else:
             ax.plot([], [], color=colour, label=f"{label} (0)")
-    ax.set_xlabel("step", fontsize=8)
+    ax.set_xlabel("optimiser step", fontsize=8)
+    ax.set_ylabel("loss", fontsize=8)
     _legend_below(ax)
 
 

@@ -96,7 +96,7 @@ def latent_space(
     if value is not None:
         border = np.nonzero(np.abs(value) <= near)[0]
         border = border[:: max(1, math.ceil(len(border) / max_points))]
-    caption = "Latent points of S, U and the unlabelled buffer"
+    caption = "Latent points (numbers without a unit) of S, U and the unlabelled buffer"
     style = dict(s=11, c=BARRIER_COLOUR, marker="o", linewidths=0, zorder=5, label=f"|B| \u2264 {near:g}")
     if p == 3:
         figure = new_figure(9.2, 4.6, f"{caption}, seen from two sides; black: the border of the learned safe set.")
@@ -351,13 +351,13 @@ def _draw_over_time(
         for colour, k in colours:
             upper.plot(time[: last[k] + 1], values[: last[k] + 1, k], color=colour, linewidth=1.2)
         upper.axhline(0, color=BARRIER_COLOUR, linewidth=1.0, linestyle=":")
-        upper.set(ylabel="B(z)", xlim=(0, end))
+        upper.set(ylabel="barrier B [latent units]", xlim=(0, end))
         upper.tick_params(labelbottom=False)
     lower = figure.add_subplot(grid[1 if values is not None else slice(None), 1])
     for colour, k in colours:
         lower.step(time[: last[k]], u[: last[k], k], where="post", color=colour, linewidth=0.8, alpha=0.85)
     lower.axhline(0, color="#999999", linewidth=0.8)
-    lower.set(ylabel=action_name, xlabel="time [s]" if dt else "step", xlim=(0, end))
+    lower.set(ylabel=action_name, xlabel="time [s]" if dt else "time [steps]", xlim=(0, end))
 
 
 def _spread(points: np.ndarray, count: int) -> np.ndarray:
@@ -414,14 +414,15 @@ def frames(env: Any, states: Any, *, captions: Sequence[str] | None = None, both
         raise ShapeError(f"captions: expected {n}, one per state, received {len(names)}.")
     pixels = env.observe(torch.as_tensor(states, dtype=torch.float32)).cpu()
     rows = 2 if both else 1
-    figure = new_figure(1.25 * n + 0.4, 1.25 * rows + 0.35, "Observations: what the agent sees, and nothing else.")
+    lines = max(name.count("\n") for name in names) + 1
+    figure = new_figure(1.6 * n + 0.4, 1.6 * rows + 0.2 + 0.15 * lines, "What the agent sees of these states, and nothing else.")
     axes = figure.subplots(rows, n, squeeze=False)
-    shown = [("t \u2212 1", slice(0, 3)), ("t", slice(3, 6))][-rows:]
+    shown = [("step before", slice(0, 3)), ("now", slice(3, 6))][-rows:]
     for row, (time, channels) in zip(axes, shown, strict=True):
         for ax, picture in zip(row, pixels, strict=True):
             ax.imshow(picture[channels].permute(1, 2, 0).numpy(), interpolation="nearest")
             ax.set(xticks=[], yticks=[])
         row[0].set_ylabel(time, fontsize=9)
     for ax, name in zip(axes[0], names, strict=True):
-        ax.set_title(name, fontsize=8)
+        ax.set_title(name, fontsize=7.5)
     return figure

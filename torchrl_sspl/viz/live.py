@@ -28,17 +28,17 @@ from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.blocks import described_system
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.runtime import CameraFault, Monitor, Shield, Verdict, Watched
+from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
 from torchrl_sspl.runtime.monitor import starts
 from torchrl_sspl.sets import UNSAFE
+from torchrl_sspl.viz.animation import HEIGHT, WIDTH, mp4_writer
 from torchrl_sspl.viz.live_page import PAGE
 from torchrl_sspl.viz.plane import require
 
 POLICIES = ("own", "random")
 PHYSICS = "physics"
-_UNPROVED_MARGIN = 0.02
 _KEPT = 300  # steps that whoever opens the page is shown at once
 _STARTS, _HORIZON, _HELD = 32, 200, 0.2  # starts that are taken in turn, longest episode, chance of a new random action
-_WIDTH, _HEIGHT = 768, 432
 #: What verdicts are called, and their colours in a film.
 VERDICTS = {
     Verdict.PROOF_APPLIES: ("Proof applies", "#13702f"),
@@ -102,7 +102,7 @@ def watch(
     _check(env, video, policy, protect, record, port, steps, fps, noise)
     monitor = Monitor.load(name)
     agent = monitor.agent
-    shield = Shield(agent, margin=None if agent.tolerated_error > 0.0 else _UNPROVED_MARGIN) if protect else None
+    shield = Shield(agent, margin=None if agent.tolerated_error > 0.0 else UNPROVED_MARGIN) if protect else None
     if video is None:
         source, pace = _of_system(agent, env, noise, seed)
     else:
@@ -426,10 +426,7 @@ class _Film:
     def __init__(self, path: Path, fps: float, title: str) -> None:
         self.path, self.title = path, title
         path.parent.mkdir(parents=True, exist_ok=True)
-        output = ["-crf", "24", "-preset", "veryfast", "-movflags", "+faststart", "-threads", "1"]
-        style = {"codec": "libx264", "quality": None, "macro_block_size": 2, "output_params": output}
-        self.writer = require("imageio_ffmpeg").write_frames(str(path), (_WIDTH, _HEIGHT), fps=fps, **style)
-        self.writer.send(None)
+        self.writer = mp4_writer(path, (WIDTH, HEIGHT), fps, preset="veryfast")  # while it happens
         self.recent: deque[dict[str, Any]] = deque(maxlen=_HORIZON)
         fonts = require("PIL.ImageFont")
         self.large, self.small = fonts.load_default(24), fonts.load_default(15)
@@ -437,7 +434,7 @@ class _Film:
     def add(self, event: dict[str, Any], frame: NDArray[np.uint8]) -> None:
         """One more picture."""
         self.recent.append(event)
-        image = require("PIL.Image").new("RGB", (_WIDTH, _HEIGHT), "white")
+        image = require("PIL.Image").new("RGB", (WIDTH, HEIGHT), "white")
         draw = require("PIL.ImageDraw").Draw(image)
         draw.text((16, 12), self.title, "#5b6470", self.small)
         image.paste(require("PIL.Image").fromarray(frame).resize((352, 352), 0), (16, 48))

@@ -27,7 +27,8 @@ POINTS: dict[int, tuple[str, str, str]] = {
     1: ("#15803d", "o", "safe (S)"),
 }
 BARRIER_COLOUR, KERNEL_COLOUR = "#111111", "#1d4ed8"
-PATH_COLOURS = ("#0072b2", "#d55e00", "#6b4c9a", "#00806b", "#b8860b", "#c2185b", "#4d6a00", "#5c5c5c")
+#: Of paths; none of them is red, which is the colour of U and of what goes wrong.
+PATH_COLOURS = ("#0072b2", "#b8860b", "#6b4c9a", "#00806b", "#3aa0d8", "#7a5230", "#4d6a00", "#5c5c5c")
 
 
 def require(module: str) -> Any:
@@ -186,10 +187,10 @@ class Plane:
                 axis.set_ticks(list(shown_marks), list(shown_marks.values()))
 
     def set_handles(self, *, beyond: bool = False) -> list[Any]:
-        """Legend entries of the areas, ``beyond``: of what lies outside the state space too."""
+        """Legend entries of the areas and of the obstacle, ``beyond``: of what lies outside the state space too."""
         patch = require("matplotlib.patches").Patch
         areas = [("S", SAFE_FILL, self.safe_set is not None), ("U", UNSAFE_FILL, self.unsafe_set is not None)]
-        areas.append(("beyond the space", OUTSIDE_FILL, beyond))
+        areas += [("obstacle", OBSTACLE_FILL, self.obstacle is not None), ("beyond the space", OUTSIDE_FILL, beyond)]
         return [patch(facecolor=c, edgecolor="#9a9a9a", linewidth=0.5, label=s) for s, c, drawn in areas if drawn]
 
     def grid(

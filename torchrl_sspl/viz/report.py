@@ -16,7 +16,7 @@ from typing import Any
 
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.files import write
-from torchrl_sspl.viz.report_style import CSS
+from torchrl_sspl.viz.report_style import CSS, SETS, picture
 
 _NOT_MEASURED = "not measured"
 _MIME = {
@@ -24,9 +24,9 @@ _MIME = {
     ".svg": "image/svg+xml", ".mp4": "video/mp4", ".webm": "video/webm",
 }  # fmt: skip
 _ASSUMED = (
-    "Measured figures hold for the distribution that they were sampled from, with the stated confidence: independent "
-    "states drawn uniformly from the named set, the simulator's dynamics and its pictures. A bound of a figure on a "
-    "grid reads the grid as if it were such a sample.",
+    "Camera, physics and starts stay as they were measured: starts are drawn uniformly from the named set, and a grid is read as "
+    "such a sample.",
+    "The labels of S and U are right.",
     "Nothing is said about other cameras, other physics or states outside the state space.",
 )
 
@@ -102,23 +102,24 @@ def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "")
     return f'<div class="scroll"><table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _verdict_kind(verdict: str) -> str:
-    """Class of a verdict: "good", "fair", "bad" or "none"."""
+def verdict_kind(verdict: str) -> str:
+    """Class of a verdict: "good", "fair" (seen, not certain), "bad" or "none"."""
     text = str(verdict).strip().lower()
-    if text.startswith(("aim", "proved", "yes", "pass")):
+    if text.startswith(("aim", "must", "proved", "yes", "pass")):
         return "good"
-    if text.startswith("must"):
+    if text in _UNCERTAIN:
         return "fair"
     return "none" if not text or text.startswith("not measured") else "bad"
 
 
-_BADGES = {"good": "\u2713", "fair": "\u2713", "bad": "\u2717", "none": "?"}
+_UNCERTAIN = ("none seen", "all seen", "too few episodes")
+_BADGES = {"good": "\u2713", "fair": "\u2248", "bad": "\u2717", "none": "?"}
 _WORDS = {"aim": "aim reached", "must": "must reached"}
 
 
 def badge(verdict: str) -> str:
-    """A verdict ("aim", "proved", "yes", "pass": good; "must": fair; "not measured"; else bad) as a mark in HTML."""
-    kind = _verdict_kind(verdict)
+    """A verdict ("aim", "must", "proved", "yes", "pass": good; see ``bounded``: fair; "not measured"; else bad) as a mark in HTML."""
+    kind = verdict_kind(verdict)
     text = _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or _NOT_MEASURED)
     return f'<span class="badge {kind}">{_BADGES[kind]}&nbsp;{escape(text)}</span>'
 
@@ -143,8 +144,31 @@ def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple
         # Nothing lies below no event at all, nothing above all of them.
         end = {"<=": 0.0, ">=": 1.0 if unit == "share" else math.inf}[r.sense]
         limits = [f"{'' if v == end else sign + ' '}{format_value(v, unit)}" for v in (r.must, r.aim)]
-        rows.append((r.label, m, *limits, verdict_in(unit, r.verdict(evaluation))))
+        rows.append((r.label, m, *limits, verdict_in(unit, bounded(r, r.verdict(evaluation), m))))
     return rows
+
+
+def bounded(requirement: Any, verdict: str, measurement: Any) -> str:
+    """A verdict "aim" or "must" stands where the 95 % bound of the measurement reaches the must too.
+
+    Else it is "none seen" (or "all seen") of what no bound of a sample can reach, and "too few episodes" of the rest.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> few, many = SimpleNamespace(lower=0.0, upper=0.06), SimpleNamespace(lower=0.0, upper=0.0009)
+        >>> rule = SimpleNamespace(sense="<=", must=0.001)
+        >>> bounded(rule, "aim", few), bounded(rule, "aim", many)
+        ('too few episodes', 'aim')
+    """
+    upward = requirement.sense == "<="
+    bound = getattr(measurement, "upper" if upward else "lower", None)
+    if bound is None or math.isnan(bound) or not verdict.startswith(("aim", "must")):
+        return verdict
+    if (bound <= requirement.must) if upward else (bound >= requirement.must):
+        return verdict
+    if requirement.must == (0.0 if upward else 1.0):
+        return "none seen" if upward else "all seen"
+    return "too few episodes"
 
 
 def verdict_in(unit: str, verdict: str) -> str:
@@ -165,17 +189,20 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
         shown = format_value(value, m.get("unit", ""))
         if shown == _NOT_MEASURED:
             verdict = _NOT_MEASURED
-        kinds.append(_verdict_kind(verdict))
+        kinds.append(verdict_kind(verdict))
         numbers = (escape(text) for text in (_bound(m), _count(m.get("n")), format_value(must), format_value(aim)))
         out.append([escape(str(label)), f"<b>{escape(shown)}</b>", *numbers, badge(verdict)])
     aims, missed, unknown = (kinds.count(kind) for kind in ("good", "bad", "none"))
-    reached = aims + kinds.count("fair")
+    fair = kinds.count("fair")
+    reached, aims = aims, sum(str(row[4]).startswith("aim") for row, kind in zip(rows, kinds, strict=True) if kind == "good")
     if not rows:
         headline, kind = "No requirements were given", "none"
     elif missed:
         headline, kind = f"{missed} of {len(rows)} requirements missed", "bad"
     elif unknown:
         headline, kind = f"{reached} of {len(rows)} requirements reached, {unknown} not measured", "none"
+    elif fair:
+        headline, kind = f"{reached} of {len(rows)} requirements reached, {fair} seen but not certain", "fair"
     else:
         headline, kind = f"All requirements reached ({len(rows)} of {len(rows)})", "good"
     if reached:
@@ -201,7 +228,7 @@ def file_uri(path: str | Path) -> str:
 
 def _shown(uri: str, alt: str, caption: str, poster: str = "") -> str:
     """A picture or film with its caption, which is HTML already; ``poster``: what is shown before the film begins."""
-    media = f'<img alt="{escape(alt)}" src="{uri}">'
+    media = f'<label class="zoom"><input type="checkbox" aria-label="full size"><span><img alt="{escape(alt)}" src="{uri}"></span></label>'
     if uri.startswith("data:video/"):
         shown = f' poster="{poster}"' if poster else ""
         media = f'<video controls loop muted playsinline preload="metadata"{shown} src="{uri}"></video>'
@@ -221,7 +248,7 @@ def _figure(name: str, value: Any) -> str:
         value, caption = value
     if hasattr(value, "savefig"):
         buffer = io.BytesIO()
-        value.savefig(buffer, format="png", dpi=130)
+        value.savefig(buffer, format="png", dpi=160)
         uri = _data_uri(buffer.getvalue(), "image/png")
         caption = caption or str(value.get_label() or "")
     elif isinstance(value, (str, Path)):
@@ -243,16 +270,16 @@ def _flatten(config: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any
     return rows
 
 
-def _measured_lines(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> list[str]:
+def _measured_lines(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> list[tuple[str, str]]:
     """The measured side of the verdict: shares of the summary with n and bound, what was missed first."""
-    lines = []
+    order, lines = ("bad", "fair", "good", "none"), []
     for label, value, _, _, verdict in rows:
         _, m = _resolve(label, value, measurements)
         if m.get("n") and m.get("upper") is not None:
-            kind = _verdict_kind(verdict)
+            kind = verdict_kind(verdict)
             shown = format_value(m.get("value"), "share")
-            lines.append((kind != "bad", f"{_BADGES[kind]} {label}: {shown} of {m['n']:,} (95 %: {_bound(m)})"))
-    return [line for _, line in sorted(lines, key=lambda pair: pair[0])]
+            lines.append((kind, f"{label}: {shown} of {m['n']:,} (95 %: {_bound(m)})"))
+    return sorted(lines, key=lambda item: order.index(item[0]))
 
 
 def _resolve(label: str, value: Any, measurements: Mapping[str, dict[str, Any]]) -> tuple[Any, Mapping[str, Any]]:
@@ -284,10 +311,11 @@ def write_report(
     video: str | Path | None = None,
     video_caption: str = "One episode: what the agent sees, the true state, and the barrier value.",
     notes: str = "",
-    headline: tuple[str, str] | None = None,
-    measured: Sequence[str] = (),
-    proved: Sequence[str] = (),
+    headline: tuple[str, str, str] | None = None,
+    measured: Sequence[str | tuple[str, str]] = (),
+    proved: Sequence[str | tuple[str, str]] = (),
     assumed: Sequence[str] | None = None,
+    kernel: bool = False,
 ) -> Path:
     """Write a run's report: one HTML file without scripts or outside resources, for desk and phone, light and dark.
 
@@ -298,7 +326,7 @@ def write_report(
         title: what was trained.
         summary: rows (label, value, must, aim, verdict), see ``requirement_rows``. A value is a number, or a
             measurement with ``value``, ``unit``, ``n``, ``events``, ``lower`` and ``upper``; a verdict starts with
-            "aim", "must", "missed" or "not measured".
+            "aim", "must", "missed" or "not measured", or is "none seen", "all seen" or "too few episodes".
         measurements: every measurement by name: mapping or dataclass as above, and with ``note``.
         figures: by name: a matplotlib Figure (its label is the caption), the path of a picture, or (either, caption).
         config: everything that determined the run, nested; its ``seed`` is named at the top.
@@ -307,10 +335,13 @@ def write_report(
         video, video_caption: mp4, webm or gif file, and what it shows; a picture beside it, of the same name with the ending .jpg, is
             shown before it begins.
         notes: text, in paragraphs separated by empty lines.
-        headline: verdict and its kind ("good", "fair", "bad" or "none") where there is no summary.
-        measured: what was measured, as sentences, where there is no summary.
-        proved: statements that are proved. Never derived from the measurements: pass what a proof has returned.
+        headline: verdict, its kind ("good", "fair", "bad" or "none") and what has to be added; default: how many rows of the
+            summary are reached.
+        measured: what was measured, as sentences or (kind, sentence); default: the shares of the summary.
+        proved: statements that are proved, likewise; those that are refuted too, as ("bad", sentence). Never derived from
+            the measurements: pass what a proof has returned.
         assumed: what both rest on; default: what holds for every sampled figure.
+        kernel: whether the true kernel is known, and explained beside S, U and B.
 
     Returns the file. Raises ShapeError if a row of the summary has not five entries; ConfigError for a figure, video,
     measurement or check that is not what was expected. Source: none.
@@ -323,11 +354,12 @@ def write_report(
     data = {name: _plain(f"measurements[{name!r}]", m) for name, m in (measurements or {}).items()}
     config = dict(config or {})
     first, kind, rows_of_summary = _summary(summary, data)
-    if not summary and headline is not None:
-        first, kind = headline
-    shown = _measured_lines(summary, data) or measured
+    more = ""
+    if headline is not None:
+        first, kind, more = headline
+    lists = (proved, measured or _measured_lines(summary, data), _ASSUMED if assumed is None else assumed)
     parts = [
-        _verdict(first, kind, proved, shown, _ASSUMED if assumed is None else assumed),
+        _verdict(first, kind, more, lists, kernel),
         _section("Film", "" if video is None else _film(Path(video), video_caption)),
         _section("Requirements", rows_of_summary),
         certificate or "",
@@ -342,8 +374,6 @@ def write_report(
 
 def write_page(path: str | Path, title: str, facts: str, body: str, css: str = "") -> Path:
     """Write, whole or not at all, a page with a title, a line of facts, a body that is HTML, and further styles."""
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
     page = (
         '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
@@ -354,19 +384,23 @@ def write_page(path: str | Path, title: str, facts: str, body: str, css: str = "
     return write(path, page)
 
 
-def _verdict(text: str, kind: str, proved: Sequence[str], measured: Sequence[str], assumed: Sequence[str]) -> str:
-    """The head of the page: the verdict, and lists of what is proved, measured and assumed."""
-    columns = (
-        ("Proved", proved or ["Nothing is claimed as proved."]),
-        ("Measured", measured or ["No share with a confidence bound."]),
-        ("Assumed", assumed or ["Nothing stated."]),
-    )
-    lists = "".join(
-        f"<div><h3>{name}</h3><ul>{''.join(f'<li>{escape(str(item))}</li>' for item in items)}</ul></div>"
-        for name, items in columns
-    )
-    head = f"<h2>{_BADGES[kind]} {escape(text)}</h2>"
-    return f'<section class="verdict {kind}">{head}<div class="columns">{lists}</div></section>'
+def _verdict(text: str, kind: str, more: str, lists: Sequence[Sequence[str | tuple[str, str]]], kernel: bool) -> str:
+    """The head of the page: the verdict, what is proved, measured and assumed, and what S, U and B are."""
+    empty = ("Nothing is claimed as proved.", "No share with a confidence bound.", "Nothing stated.")
+    columns = zip(("Proved", "Measured", "Assumed"), lists, empty, strict=True)
+    cells = "".join(f"<div><h3>{name}</h3><ul>{''.join(map(_item, items or [none]))}</ul></div>" for name, items, none in columns)
+    names = [name for name in SETS if kernel or name != "true kernel"]
+    terms = "".join(f"<dt>{escape(name)}</dt><dd>{escape(SETS[name])}</dd>" for name in names)
+    sets = f'<div class="sets">{picture(kernel)}<dl>{terms}</dl></div>'
+    head = f"<h2>{_BADGES[kind]} {escape(text)}</h2>" + (f"<p>{escape(more)}</p>" if more else "")
+    return f'<section class="verdict {kind}">{head}<div class="columns">{cells}</div>{sets}</section>'
+
+
+def _item(item: str | tuple[str, str]) -> str:
+    """A sentence, with the mark of its kind where it has one."""
+    kind, text = ("none", item) if isinstance(item, str) else item
+    mark = "" if kind == "none" else f"<b>{_BADGES[kind]}</b> "
+    return f'<li class="{kind}">{mark}{escape(str(text))}</li>'
 
 
 def _facts(config: Mapping[str, Any]) -> list[str]:
@@ -393,7 +427,7 @@ def _measurements(data: Mapping[str, dict[str, Any]]) -> str:
         texts = (escape(text) for text in (value, _bound(m), n, str(m.get("note", ""))))
         cells.append([f"<code>{escape(name)}</code>", *texts])
     body = table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
-    return f"<section><details open><summary>All {len(data)} measurements</summary>{body}</details></section>"
+    return f"<section><details><summary>All {len(data)} measurements</summary>{body}</details></section>"
 
 
 def _configuration(config: Mapping[str, Any]) -> str:

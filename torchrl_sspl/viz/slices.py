@@ -138,6 +138,6 @@ def walks(plane: Plane, states: Any, alive: Any, wrong: Any, *, limit: int = 60,
         ax.plot(*plane.unwrap_breaks(path).T, color=colour, linewidth=1.0)
         ax.plot(*path[0], "o", color=colour, markersize=4, markeredgecolor="white")
     ax.set_aspect("equal")
-    handles = [*plane.set_handles(), line_handle(_WRONG, f"went wrong ({len(worse)})")]
+    handles = [*plane.set_handles(beyond=True), line_handle(_WRONG, f"went wrong ({len(worse)})")]
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False)
     return figure

@@ -1,0 +1,96 @@
+"""The first screen says what is proved, refuted, measured and not certified, and is green only where bounds allow it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from torchrl_sspl.certification.certificate import PROVED, Certificate, Layer, Reason, Statement
+from torchrl_sspl.envs.system import Requirement
+from torchrl_sspl.evaluation.measurements import Evaluation, share
+from torchrl_sspl.modules.agent import agent_directory
+from torchrl_sspl.viz.report import badge, bounded, requirement_rows
+from torchrl_sspl.viz.verdict import first_screen
+
+TOUCH = Requirement("safe_rollouts_touch_unsafe", "episodes that touch U", "<=", 0.01, 0.0)
+LEAVE = Requirement("leave", "episodes that leave", "<=", 0.0, 0.0)
+
+
+def shipped(name: str) -> Certificate:
+    return Certificate.load(agent_directory(name) / "certificate.json")
+
+
+def rows(events: int, n: int):
+    found = Evaluation()
+    found.add(share(TOUCH.name, events, n))
+    return requirement_rows([TOUCH, Requirement("lost", "what nobody measured", "<=", 0.1, 0.0)], found)
+
+
+def test_the_shipped_pendulum_is_safe_as_far_as_its_certificate_reaches():
+    screen = first_screen(shipped("pendulum"), rows(0, 3000)[:1], trained=False)
+    assert screen.kind == "good"
+    assert screen.headline == (
+        "Safe as far as this reaches: the policy provably keeps the safe set {B <= 0} in the learned dynamics; none of 3,000 fresh "
+        "episodes left it or met U (at most 0.123 %); the proof reaches at least 99.1 % of them."
+    )
+    assert "Not certified: the paper's own conditions" in screen.more
+    assert "this run trains and proves nothing" in screen.more
+    assert screen.proved[0] == ("good", "In the learned dynamics the policy leads every latent with B <= 0 to one with B <= 0.")
+    assert not any("rounding of the float64" in text or "known types" in text for _, text in screen.proved)
+
+
+def test_the_shipped_quadruped_is_refuted_and_says_so_first():
+    screen = first_screen(shipped("quadruped"), rows(0, 3000), trained=False)
+    assert screen.kind == "bad"
+    assert screen.headline.startswith("Not certified as safe: the proof is refuted")
+    assert "20 of 3,000 fresh episodes left it or met U (at most 1.03 %)" in screen.headline
+    assert screen.proved[0][0] == "bad"
+    assert "Refuted by a counterexample" in screen.proved[0][1]
+    assert screen.measured[0][0] == "bad"
+
+
+def test_few_episodes_are_never_green():
+    screen = first_screen(shipped("pendulum"), rows(0, 50))
+    assert screen.kind == "fair"
+    assert "this run is too small to confirm it" in screen.headline
+    assert "none of 50 (at most 5.82 %)" in screen.more
+    assert ("fair", "episodes that touch U: none of 50 (95 %: at most 5.82 %; must be ≤ 1 %).") in screen.measured
+    assert screen.measured[-1] == ("none", "Not measured in this run: what nobody measured.")
+
+
+def test_a_missed_requirement_is_red_whatever_is_proved():
+    screen = first_screen(shipped("pendulum"), rows(60, 3000))
+    assert screen.kind == "bad"
+    assert "misses requirements" in screen.headline
+    assert "1 of 2 requirements is missed" in screen.more
+
+
+@pytest.mark.parametrize(
+    ("reason", "words"), [("EMPTY", "Not safe: no safe set was found"), ("UNDECIDED", "nothing is proved, as the budget was too small")]
+)
+def test_what_is_not_proved_is_named(reason, words):
+    layer = Layer("deterministic", [Statement("not vacuous", "t", PROVED, False, reason=Reason[reason].name)])
+    screen = first_screen(Certificate("demo", "", "", 0.0, {"deterministic": layer}))
+    assert words in screen.headline
+    assert screen.kind != "good"
+
+
+def test_without_a_certificate_nothing_is_green():
+    screen = first_screen(None, rows(0, 3000))
+    assert (screen.kind, screen.headline) == ("none", "Measured, without a certificate: nothing is proved.")
+
+
+@pytest.mark.parametrize(
+    ("requirement", "events", "n", "verdict"),
+    [
+        (TOUCH, 0, 3000, "aim"), (TOUCH, 0, 50, "too few episodes"), (LEAVE, 0, 3000, "none seen"), (TOUCH, 60, 3000, "missed by 0.01"),
+        (Requirement("r", "return", ">=", 0.95, 1.0), 10, 10, "too few episodes"), (Requirement("r", "all", ">=", 1.0, 1.0), 10, 10, "all seen"),
+        (Requirement("r", "return", ">=", 0.95, 1.0), 400, 400, "aim"),
+    ],
+)  # fmt: skip
+def test_a_verdict_stands_only_where_the_bound_reaches_the_must(requirement, events, n, verdict):
+    m = share(requirement.name, events, n)
+    said = requirement.verdict(SimpleNamespace(measurements={requirement.name: m}))
+    assert bounded(requirement, said, m) == verdict
+    assert ("good" in badge(bounded(requirement, said, m))) == (verdict == "aim")
