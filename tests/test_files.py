@@ -13,7 +13,7 @@ import pytest
 
 from torchrl_sspl import files
 from torchrl_sspl.errors import OutputError
-from torchrl_sspl.files import RunDirectory, write
+from torchrl_sspl.files import RunDirectory, append, write
 
 
 def test_a_file_that_cannot_be_written_to_the_end_leaves_the_old_one(tmp_path, monkeypatch):
@@ -31,8 +31,18 @@ def test_a_file_that_cannot_be_written_to_the_end_leaves_the_old_one(tmp_path, m
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_lines_are_added_and_a_file_that_takes_none_is_named(tmp_path):
+    for line in ("one", "two"):
+        append(tmp_path / "new" / "log.jsonl", line)
+    assert (tmp_path / "new" / "log.jsonl").read_text() == "one\ntwo\n"
+    with pytest.raises(OutputError, match=r"expected to add to '.*new', received"):
+        append(tmp_path / "new", "three")
+
+
 def test_a_directory_that_cannot_be_made_is_named(tmp_path):
     (tmp_path / "runs").write_text("a file")
+    with pytest.raises(OutputError, match=r"expected to write '.*runs/one/a.json'"):
+        write(tmp_path / "runs" / "one" / "a.json", "")
     with pytest.raises(OutputError, match=r"out_dir=.*runs/one.*choose another out_dir"):
         RunDirectory(tmp_path / "runs" / "one")
 

@@ -58,6 +58,36 @@ def test_it_waits_for_the_state_to_be_saved_and_not_longer():
     assert done == [True]
 
 
+def test_a_signal_ends_what_follows_where_nobody_asked_meanwhile():
+    done = []
+
+    def work():
+        with interruptible():
+            with saving():
+                signal.raise_signal(signal.SIGTERM)
+                done.append("saved")
+            done.append("never")
+
+    with pytest.raises(Interrupted):
+        work()
+    assert done == ["saved"]
+
+
+def test_nothing_waits_any_more_once_all_is_saved():
+    done = []
+
+    def work():
+        with interruptible():
+            with saving():
+                done.append("saved")
+            signal.raise_signal(signal.SIGTERM)
+            done.append("never")
+
+    with pytest.raises(Interrupted):
+        work()
+    assert done == ["saved"]
+
+
 def test_a_second_signal_does_not_wait():
     done = []
 

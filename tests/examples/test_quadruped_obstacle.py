@@ -84,7 +84,7 @@ def test_a_trained_agent_walks_and_none_is_trained(program, trained, tmp_path):
         ("sed=1", "the nearest are seed"),
         ("mode=fly", "expected a valid key, received 'mode'"),
         ("walks=1", "the nearest are evaluation.walks"),
-        ("preset=quick", "sound, paper, smoke"),
+        ("preset=fast", "sound, quick, paper, smoke"),
         ("env.yaw_lag=maybe", "a list of numbers"),
         ("agent=nobody", "nobody"),
     ],

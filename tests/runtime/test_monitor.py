@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError, ShapeError
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.evaluation.controllers import as_controller
 from torchrl_sspl.modules.agent import load
@@ -178,12 +179,20 @@ def test_another_number_of_pictures_is_refused():
         Monitor.load("pendulum", batch_size=2).step(shown(3)[0])
 
 
-def test_a_calibration_belongs_to_one_agent(tmp_path):
+def test_a_calibration_belongs_to_one_agent_and_is_replaced_in_one_step(tmp_path, monkeypatch):
     agent = load("pendulum")
     with pytest.raises(CheckpointError, match="calibrate"):
         Calibration.load(agent.save(tmp_path), agent)
     Calibration.load("pendulum", agent).save(tmp_path)
     assert set(Calibration.load(tmp_path, agent).limits) == set(SIGNALS)
+    def full(*_):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "replace", full)
+        with pytest.raises(OutputError, match="as it was before"):
+            Calibration.load("pendulum", agent).save(tmp_path)
+    assert Calibration.load(tmp_path, agent).episodes == Calibration.load("pendulum", agent).episodes
     agent.barrier[-1].bias.data.add_(0.1)
     with pytest.raises(CheckpointError, match="other weights"):
         Calibration.load(tmp_path, agent)

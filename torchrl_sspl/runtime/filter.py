@@ -18,6 +18,7 @@ from torchrl_sspl.modules.observer import LatentObserver
 
 MODES = ("nearest", "blend")
 LEVEL = -0.1
+UNPROVED_MARGIN = 0.02  # for an agent without a proof
 _GRID, _MOST = 81, 729  # actions per dimension that are tried, and in all
 _LINE, _HALVINGS = 16, 8  # actions on the way to the agent's own one, and halvings of what is left of the way
 
@@ -70,7 +71,7 @@ class Shield:
         if margin is None and not agent.tolerated_error > 0.0:
             raise ConfigError(
                 "expected an agent whose set is proved to be kept (a tolerated error above 0), received one without; see what "
-                "`sspl verify` says of it, or give margin=0.02 and the like: then the filter guarantees nothing"
+                f"`sspl verify` says of it, or give margin={UNPROVED_MARGIN:g} and the like: then the filter guarantees nothing"
             )
         self.agent, self.mode, self.level = agent, mode, float(level)
         self.margin = _proved_margin(agent) if margin is None else float(margin)

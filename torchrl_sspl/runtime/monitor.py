@@ -13,7 +13,7 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional as F
 from tqdm import tqdm
@@ -22,6 +22,7 @@ from torchrl_sspl.certification.certificate import weights_digest
 from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import Decision
 from torchrl_sspl.evaluation.simulation import simulate
+from torchrl_sspl.files import write
 from torchrl_sspl.modules.agent import Agent, agent_directory
 from torchrl_sspl.modules.controller import Controller, Step
 from torchrl_sspl.modules.networks import mlp
@@ -112,13 +113,11 @@ class Calibration:
         return min(1.0, (len(SIGNALS) + len(TWO_SIDED)) / (self.episodes + 1))
 
     def save(self, directory: str | Path) -> Path:
-        """Write ``monitor.safetensors`` beside an agent; returns the file."""
+        """Write ``monitor.safetensors`` beside an agent; returns the file. Raises OutputError if that cannot be done."""
         path = Path(directory) / FILE
-        path.parent.mkdir(parents=True, exist_ok=True)
         about = {"limits": self.limits, "episodes": self.episodes, "steps": self.steps, "weights": self.weights}
         state = {k: v.contiguous() for k, v in self.model.state_dict().items()}
-        save_file(state, path, {k: json.dumps(v) for k, v in about.items()})
-        return path
+        return write(path, save(state, {k: json.dumps(v) for k, v in about.items()}))
 
     @classmethod
     def load(cls, name: str | Path, agent: Agent) -> Calibration:
@@ -128,14 +127,16 @@ class Calibration:
             raise CheckpointError(f"expected a calibration in '{path}', received none; make one: sspl.calibrate(agent, env).save(...)")
         try:
             with safe_open(path, "pt") as file:
-                about = {k: json.loads(v) for k, v in file.metadata().items()}
+                about = {k: json.loads(v) for k, v in (file.metadata() or {}).items()}
                 state = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118
             model = PictureModel(agent.latent_dim)
             model.load_state_dict(state)
             model.requires_grad_(False)
             limits = {k: (float(a), float(b)) for k, (a, b) in about["limits"].items()}
             found = cls(model, limits, int(about["episodes"]), int(about["steps"]), str(about["weights"]))
-        except (SafetensorError, RuntimeError, KeyError, TypeError, ValueError) as error:
+            if found.episodes < 1 or found.steps < 1 or not all(low <= high for low, high in limits.values()):
+                raise ValueError("counts below one, or limits that nothing is within")
+        except (SafetensorError, RuntimeError, KeyError, TypeError, ValueError, AttributeError) as error:
             raise CheckpointError(f"expected a calibration in '{path}', received {type(error).__name__}: {str(error)[:200]}") from error
         if found.weights != weights_digest(agent.state_dict()) or set(limits) != set(SIGNALS):
             raise CheckpointError(f"expected a calibration of this agent in '{path}', received one of other weights; calibrate again")
