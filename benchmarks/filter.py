@@ -21,6 +21,7 @@ from torchrl_sspl.evaluation.blocks import described_system
 from torchrl_sspl.evaluation.controllers import AgentController, Decision
 from torchrl_sspl.evaluation.simulation import Episodes
 from torchrl_sspl.runtime import Protected, SafetyWrapper, Shield
+from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
 from torchrl_sspl.runtime.monitor import starts
 from torchrl_sspl.sets import UNSAFE
 
@@ -140,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     env: Any = factory([1], SEED)
     env = env.known_twin() if given.physics else env
     start = starts(agent, env, given.episodes, torch.Generator().manual_seed(SEED))
-    margin = given.margin if given.margin is not None or agent.tolerated_error > 0 else 0.02
+    margin = given.margin if given.margin is not None or agent.tolerated_error > 0 else UNPROVED_MARGIN
     print("| Actions | filter | episodes that enter U | hit | fallen | steps with an intervention | mean deviation [half ranges] |")
     print("|---|---|---|---|---|---|---|")
     policies = {"random": random_actions, "adversarial": ADVERSARIAL[given.agent], "own": None}

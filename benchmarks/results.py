@@ -15,6 +15,7 @@ FURTHER = {
     "walks_from_safe_hit": "walks from S that hit the obstacle or enter U",
     "walks_from_set_hit": "walks from {B <= 0} that hit the obstacle",
     "walks_from_set_fall": "walks from {B <= 0} that fall",
+    "walks_from_set_covered": "walks from {B <= 0} to which the proof applies from the first step to the last",
     "safe_rollouts_leave": "episodes from {B <= 0} that leave it",
     "safe_rollouts_seen_outside": "episodes from {B <= 0} in which a picture by itself has B > 0",
     "corrections_cut": "their steps at which a correction is cut",

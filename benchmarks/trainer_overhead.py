@@ -27,7 +27,6 @@ import torch
 from loss_overhead import bare_sound, bare_world_model, networks
 from torch import Tensor, nn
 from torchrl.collectors import Collector
-from tqdm import tqdm
 
 from torchrl_sspl.configs import SynthesisConfig
 from torchrl_sspl.data import collect_random
@@ -47,6 +46,7 @@ from torchrl_sspl.trainers import (
     TeachPolicy,
     Workspace,
 )
+from torchrl_sspl.trainers.progress import Progress
 from torchrl_sspl.trainers.synthesis import off_manifold, targets
 
 CLIP = 5.0
@@ -55,7 +55,7 @@ Side = tuple[Callable[[int], None], list[nn.Parameter]]  # takes so many updates
 
 
 def _bar() -> Any:
-    return tqdm(total=10**6, file=io.StringIO())
+    return Progress(10**6, 0, file=io.StringIO())
 
 
 # ---------------------------------------------------------------------- joint training

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import html
+import json
 import logging
 import re
 import tomllib
@@ -33,11 +34,20 @@ SECTIONS = {  # in the order of the floors, from the mathematics to the tools
     "certification": "Certification",
     "data": "Data",
     "objectives": "Losses",
+    "viability": "True kernels",
+    "evaluation": "Evaluation",
     "runtime": "At run time",
     "trainers": "Training",
     "viz": "Figures and reports",
+    "experiments": "Experiments",
+    "configs": "Configuration",
     "cli": "Command line",
+    "devices": "Devices",
+    "files": "Files",
+    "interrupts": "Signals",
+    "seeds": "Seeds",
 }
+TOGETHER = ("errors", "configs")  # classes of a few lines each: all of them on one page
 log = logging.getLogger("mkdocs.hooks.sspl")
 
 
@@ -117,30 +127,90 @@ def api_index() -> str:
     return "\n".join([*lines, f"| {anchor('__version__')}`sspl.__version__` | version of the library |", ""])
 
 
-def summary(dotted: str) -> str:
-    """First sentence of the docstring of a function or class."""
-    part, *_, name = dotted.split(".")[1:]
+def definition(dotted: str) -> ast.FunctionDef | ast.ClassDef | None:
+    """A function or class, wherever in its part it is written; None for a constant."""
+    part, *inner, name = dotted.split(".")[1:]
     root = ROOT / PACKAGE / part
-    for path in sorted(root.rglob("*.py")) if root.is_dir() else [root.with_suffix(".py")]:
+    paths = sorted(root.rglob("*.py")) if root.is_dir() else [root.with_suffix(".py")]
+    if inner:
+        paths = [root.joinpath(*inner).with_suffix(".py"), root.joinpath(*inner, "__init__.py"), *paths]
+    for path in filter(Path.is_file, paths):
         for node in ast.parse(path.read_text()).body:
             if getattr(node, "name", None) == name and isinstance(node, ast.FunctionDef | ast.ClassDef):
-                first = " ".join((ast.get_docstring(node) or "").split("\n\n")[0].split())
-                return to_markdown(re.split(r"\.(?: |$)", first)[0]).replace("|", "\\|")
-    return ""
+                return node
+    return None
+
+
+def summary(dotted: str) -> str:
+    """First sentence of the docstring of a function or class."""
+    node = definition(dotted)
+    first = " ".join((ast.get_docstring(node) or "" if node else "").split("\n\n")[0].split())
+    return to_markdown(re.split(r"\.(?: |$)", first)[0]).replace("|", "\\|")
 
 
 def api_page(part: str) -> str:
     root = ROOT / PACKAGE / part
     source = root / "__init__.py" if root.is_dir() else root.with_suffix(".py")
     intro = ast.get_docstring(ast.parse(source.read_text())) or ""
-    names = documented(part)
+    names, apart = documented(part), own_pages(part)
     title = SECTIONS.get(part, part)
     lines = [f"# {title}", "", f"`{PACKAGE}.{part}`", "", to_markdown(intro.split("\n\n")[0]), ""]
     if len(names) > 4:
-        lines += [" · ".join(f"[`{name.rsplit('.', 1)[1]}`][{name}]" for name in names), ""]
+        lines += ["| Name | Is |", "|---|---|", *(f"| [`{n.rsplit('.', 1)[1]}`][{n}] | {summary(n)} |" for n in names), ""]
     for name in names:
-        lines += [f"::: {name}", ""]
+        lines += [f"::: {name}", ""] if name not in apart else []
     return "\n".join(lines)
+
+
+def own_pages(part: str) -> dict[str, str]:
+    """Names of a part that are not on its page: each class has one, and what a module does not export shares that of the module."""
+    if part in TOGETHER or not (ROOT / PACKAGE / part).is_dir():
+        return {}
+    pages = {}
+    for name in documented(part):
+        *inner, short = name.split(".")[2:]
+        if isinstance(definition(name), ast.ClassDef):
+            pages[name] = f"api/{part}/{short}.md"
+        elif inner:
+            pages[name] = f"api/{part}/{'.'.join(inner)}.md"
+    classes = [place.lower() for place in pages.values() if not Path(place).stem[0].islower()]
+    if len(set(classes)) < len(classes):
+        raise ValueError(f"expected classes of different names in '{part}', found two pages of one name: rename one")
+    return pages
+
+
+def inner_page(place: str, names: list[str]) -> str:
+    """Page of a class, or of the functions of a module."""
+    if not Path(place).stem[0].islower():
+        return f"::: {names[0]}\n    options: {{heading_level: 1}}\n"
+    module = names[0].rsplit(".", 1)[0]
+    return "\n".join([f"# {module.rsplit('.', 1)[1]}", "", f"`{module}`", "", *(f"::: {name}\n" for name in names)])
+
+
+def inner_pages(part: str) -> dict[str, list[str]]:
+    """Names on each further page of a part, by its place."""
+    pages: dict[str, list[str]] = {}
+    for name, place in own_pages(part).items():
+        pages.setdefault(place, []).append(name)
+    return dict(sorted(pages.items(), key=lambda item: Path(item[0]).stem[0].islower()))
+
+
+def api_pages() -> dict[str, str]:
+    """Content of all pages of the API, by place."""
+    pages = {"api/index.md": api_index()}
+    for part in filter(documented, parts()):
+        pages[f"api/{part}.md"] = api_page(part)
+        pages |= {place: inner_page(place, names) for place, names in inner_pages(part).items()}
+    return pages
+
+
+def api_navigation() -> list[Any]:
+    """The parts, each with the pages of its classes."""
+    entries: list[Any] = ["api/index.md"]
+    for part in filter(documented, parts()):
+        inner = [{Path(place).stem: place} for place in inner_pages(part)]
+        entries.append({SECTIONS.get(part, part): [f"api/{part}.md", *inner] if inner else f"api/{part}.md"})
+    return entries
 
 
 # ------------------------------------------------------------------ gallery
@@ -184,6 +254,24 @@ def gallery_index() -> str:
         for name, words in list(gallery_pictures(path).items())[:1]:
             lines += [f"[![{words}](../images/{name}){{ width=420 }}]({path.stem}.md)", ""]
     return "\n".join(lines)
+
+
+# ---------------------------------------------------------------- notebooks
+
+
+def notebooks() -> list[Path]:
+    return sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
+
+
+def cells(path: Path) -> list[tuple[str, str]]:
+    """Kind ("markdown" or "code") and text of every cell of a notebook."""
+    return [(cell["cell_type"], "".join(cell["source"])) for cell in json.loads(path.read_text())["cells"]]
+
+
+def notebook_page(path: Path) -> str:
+    parts = [text if kind == "markdown" else f"```python\n{text}\n```" for kind, text in cells(path)]
+    link = f"[This page as a notebook]({path.name}){{ download }}; the tests run it."
+    return "\n\n".join([parts[0], link, *parts[1:]]) + "\n"
 
 
 # ------------------------------------------------- reStructuredText to Markdown
@@ -270,10 +358,10 @@ def on_config(config: Any) -> Any:
         if value == "gallery/":
             value = ["gallery/index.md", *({gallery_title(p): f"gallery/{p.stem}.md"} for p in examples())]
         elif value == "api/":
-            value = ["api/index.md", *({SECTIONS.get(p, p): f"api/{p}.md"} for p in parts() if documented(p))]
+            value = api_navigation()
         elif isinstance(value, list):
             value = fill(value)
-        elif not (docs / value).exists():
+        elif not (docs / value).exists() and not (docs / value).with_suffix(".ipynb").exists():
             log.info("no page %s yet", value)
             return None
         return {title: value}
@@ -283,9 +371,9 @@ def on_config(config: Any) -> Any:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    pages = {"gallery/index.md": gallery_index(), "api/index.md": api_index()}
+    pages = {"gallery/index.md": gallery_index()} | api_pages()
     pages |= {f"gallery/{path.stem}.md": gallery_page(path) for path in examples()}
-    pages |= {f"api/{part}.md": api_page(part) for part in parts() if documented(part)}
+    pages |= {f"notebooks/{path.stem}.md": notebook_page(path) for path in notebooks()}
     for place, content in pages.items():
         files.append(File.generated(config, place, content=content))
     return files
@@ -325,5 +413,5 @@ def draw(match: re.Match[str]) -> str:
 
 def on_page_content(content: str, **_: Any) -> str:
     content = FIGURE.sub(draw, content)
-    content = INLINE.sub(lambda match: formula(match[1], "inline"), content)
+    content = INLINE.sub(lambda match: f'<span class="in-line">{formula(match[1], "inline")}</span>', content)
     return DISPLAY.sub(lambda match: f'<div class="formula">{formula(match[1], "block")}</div>', content)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -31,6 +33,7 @@ def load(name: str) -> ModuleType:
 
 
 hooks, check_site = load("hooks"), load("check_site")
+api_pages = functools.cache(hooks.api_pages)  # ten seconds
 
 
 def code(path: Path) -> str:
@@ -70,7 +73,7 @@ def test_code_of_a_page_keeps_its_lines(tmp_path):
 
 def test_every_public_name_has_a_place():
     """Against the snapshot of the public names, without building."""
-    written = hooks.api_index() + "".join(hooks.api_page(part) for part in hooks.parts())
+    written = "\n".join(api_pages().values())
     lines = (ROOT / "tests" / "api_surface.txt").read_text().splitlines()
     missing = []
     for line in lines:
@@ -92,8 +95,8 @@ def test_every_example_is_in_the_gallery_with_its_code():
 
 @pytest.mark.parametrize("path", PAGES, ids=lambda path: str(path.relative_to(DOCS)))
 def test_links_between_pages_exist(path):
-    generated = {f"gallery/{p.stem}.md" for p in hooks.examples()} | {f"api/{p}.md" for p in hooks.parts()}
-    generated |= {"gallery/index.md", "api/index.md"}
+    generated = {f"gallery/{p.stem}.md" for p in hooks.examples()} | {"gallery/index.md", *api_pages()}
+    generated |= {f"notebooks/{p.stem}.md" for p in hooks.notebooks()}
     text = re.sub(r"^```.*?^```", "", hooks.on_page_markdown(path.read_text()), flags=re.DOTALL | re.MULTILINE)
     for target in re.findall(r"\]\((?!https?:|mailto:)([^)#\s]+)", text):
         place = (path.parent / target).resolve()
@@ -148,6 +151,23 @@ def test_a_good_site_passes(tmp_path):
     (tmp_path / "index.html").write_text('<a href="other.html#pkg.name">x</a> <a href="https://example.org">y</a>')
     (tmp_path / "other.html").write_text('<h2 id="pkg.name">x</h2> <a href="#pkg.name">up</a>')
     assert check_site.problems(tmp_path, ["pkg.name"]) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("path", hooks.notebooks(), ids=lambda path: path.stem)
+def test_notebook_runs(path, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"__name__": "notebook"}
+    for number, (kind, text) in enumerate(hooks.cells(path)):
+        if kind == "code":
+            exec(compile(text, f"{path.stem}, cell {number}", "exec"), names)
+
+
+def test_notebooks_are_saved_without_outputs_and_are_pages():
+    assert [p.stem for p in hooks.notebooks()] == ["certify_your_own", "quickstart"]
+    for path in hooks.notebooks():
+        assert all(not cell.get("outputs") for cell in json.loads(path.read_text())["cells"])
+        assert all(text in hooks.notebook_page(path) for _, text in hooks.cells(path))
 
 
 @pytest.mark.slow
