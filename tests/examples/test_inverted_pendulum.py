@@ -93,7 +93,7 @@ def test_the_paper_preset_reports_its_margins(program, tmp_path):
 
 @pytest.mark.parametrize(
     ("word", "said"),
-    [("sed=1", "the nearest are seed"), ("preset=fast", "sound, quick, paper, smoke"), ("network.latent_dim=two", "an integer")],
+    [("sed=1", "the nearest are seed"), ("preset=fast", "sound, paper, quick, smoke"), ("network.latent_dim=two", "an integer")],
 )
 def test_a_wrong_word_names_the_right_one(program, capsys, word, said):
     assert program(EXAMPLE, word) == 2

@@ -84,7 +84,7 @@ def test_a_trained_agent_walks_and_none_is_trained(program, trained, tmp_path):
         ("sed=1", "the nearest are seed"),
         ("mode=fly", "expected a valid key, received 'mode'"),
         ("walks=1", "the nearest are evaluation.walks"),
-        ("preset=fast", "sound, quick, paper, smoke"),
+        ("preset=fast", "sound, paper, quick, smoke"),
         ("env.yaw_lag=maybe", "a list of numbers"),
         ("agent=nobody", "nobody"),
     ],
@@ -95,7 +95,7 @@ def test_a_wrong_word_is_named(program, capsys, word, said, tmp_path):
     assert not list(tmp_path.glob("**/*.json"))
 
 
-@pytest.mark.parametrize("preset", ["sound", "paper", "smoke"])
+@pytest.mark.parametrize("preset", ["sound", "paper", "quick", "smoke"])
 def test_every_preset_is_valid_and_can_be_overridden(preset):
     config = compose(["env=quadruped", f"preset={preset}", "network.latent_dim=5", "evaluation.walks=7"]).check()
     assert config.network.lipschitz_bound == 1.5
