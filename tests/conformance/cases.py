@@ -249,4 +249,12 @@ CASES = [
         "dynamics barrier policy",
         {"depth": 2.0, "worst_fraction": 0.25, "dynamics_margin": 1.0},
     ),
+    Case(
+        "counterexample-least",
+        CounterexampleLoss,
+        "latent",
+        {"loss_counterexample": {"barrier", "actor_network"}},
+        "dynamics barrier policy",
+        {"mode": "least", "depth": 2.0, "worst_fraction": 0.25, "dynamics_margin": 1.0},
+    ),
 ]

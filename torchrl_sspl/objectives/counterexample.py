@@ -1,4 +1,4 @@
-"""The loss on counterexamples of the proof: the set gives them up, rather than growing around their successors."""
+"""The loss on counterexamples of the proof: the set gives them up, or changes as little as will do."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.objectives.base import LatentLoss, trained_action
 
+MODES = ("give_up", "least")
+
 
 class CounterexampleLoss(LatentLoss):
     r"""Takes latents that are led out of the set out of it, and leads them back where the policy can.
@@ -24,8 +26,12 @@ class CounterexampleLoss(LatentLoss):
 
     with bars over what is held still: the barrier changes at z alone, the policy through its successor alone. The product
     of both violations, on which :class:`SynthesisLoss` descends, may also lower the barrier at the successor; then the
-    set grows to where nothing was asked of it, and what it meets there are the next counterexamples. Output:
-    ``loss_counterexample``, and the detached metrics ``counterexample_max`` (largest v) and ``counterexample_share`` (of
+    set grows to where nothing was asked of it, and what it meets there are the next counterexamples. Where a set is nearly kept, because
+    its targets are exact, that does not matter, and the smaller of both changes leaves more of it (``mode="least"``):
+
+    .. math:: L = \operatorname{mean} \max(0, \min(B(d(z, \pi(z)) + e) + m, b - B(z)))
+
+    Output: ``loss_counterexample``, and the detached metrics ``counterexample_max`` (largest v) and ``counterexample_share`` (of
     rows with v > 0). Source: none (counterexample-guided synthesis).
 
     Args:
@@ -35,6 +41,7 @@ class CounterexampleLoss(LatentLoss):
         depth: b, barrier value up to which a counterexample is pushed.
         cap: c, violation from which on the push is no stronger.
         policy_coeff: :math:`\kappa`.
+        mode: ``"give_up"`` or ``"least"``.
         error: :math:`\delta`, error per step that the set has to tolerate, in the direction in which the barrier rises.
         **shared: ``dynamics_margin`` m, ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`, for
             errors too.
@@ -56,13 +63,17 @@ class CounterexampleLoss(LatentLoss):
         depth: float = 0.01,
         cap: float = 0.05,
         policy_coeff: float = 0.3,
+        mode: str = "give_up",
         error: float = 0.0,
         **shared: Any,
     ) -> None:
         if not depth > 0.0 or not cap > 0.0 or not error >= 0.0:
             raise ConfigError(f"expected depth > 0, cap > 0 and error >= 0, received {depth}, {cap} and {error}")
+        if mode not in MODES:
+            raise ConfigError(f"expected mode to be one of {MODES}, received {mode!r}")
         super().__init__(dynamics=dynamics, barrier=barrier, policy=policy, **shared)
         self._coefficients(policy_coeff=policy_coeff)
+        self.mode = mode
         self.depth, self.cap, self.error = float(depth), float(cap), float(error)
         self.out_keys += ["loss_counterexample", "counterexample_max", "counterexample_share"]
 
@@ -73,17 +84,19 @@ class CounterexampleLoss(LatentLoss):
         after = self._run("dynamics", batch.latent, trained_action(self, batch.latent), params="frozen")
         if self.error:
             after = after + worst_error(lambda z: self._run("barrier", z, params="frozen"), after, self.error)
-        violation = (self._run("barrier", after, params="frozen") + self.dynamics_margin).clamp_min(0.0)
+        least = self.mode == "least"
+        violation = (self._run("barrier", after, params="online" if least else "frozen") + self.dynamics_margin).clamp_min(0.0)
         short = (self.depth - self._run("barrier", batch.latent)).clamp_min(0.0)
+        if least:
+            return self._terms(self._reduce(torch.minimum(violation, short), batch, worst=True), violation, short, tensordict)
         given_up = violation.detach().clamp_max(self.cap) / self.cap * short
         led_back = self.policy_coeff * violation * (short.detach() > 0.0)
+        return self._terms(self._reduce(given_up, batch, worst=True) + self._reduce(led_back, batch), violation, short, tensordict)
+
+    def _terms(self, loss: Tensor, violation: Tensor, short: Tensor, tensordict: TensorDictBase) -> TensorDict:
         found = violation.detach() * (short.detach() > 0.0)
-        terms = {
-            "loss_counterexample": self._reduce(given_up, batch, worst=True) + self._reduce(led_back, batch),
-            "counterexample_max": found.max(),
-            "counterexample_share": (found > 0.0).float().mean(),
-        }
-        return self._pack(terms, tensordict)
+        counts = {"counterexample_max": found.max(), "counterexample_share": (found > 0.0).float().mean()}
+        return self._pack({"loss_counterexample": loss, **counts}, tensordict)
 
 
 def worst_error(barrier: Callable[[Tensor], Tensor], latent: Tensor, size: float) -> Tensor:

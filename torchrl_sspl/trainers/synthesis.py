@@ -10,22 +10,27 @@ and policy onto the largest robust invariant set of the cloud of latents (or the
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
+from scipy.ndimage import distance_transform_edt
 from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.configs.schema import SynthesisConfig
+from torchrl_sspl.functional import safe_hinge
 from torchrl_sspl.modules.observer import corrected, gain_matrix
 from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
-from torchrl_sspl.viability import viability_kernel
+from torchrl_sspl.viability import ViabilityKernel, viability_kernel
 from torchrl_sspl.viability.cloud import (
     barrier_targets,
     nearby_residuals,
@@ -37,6 +42,7 @@ from torchrl_sspl.viability.cloud import (
     signed_margin,
     value_targets,
 )
+from torchrl_sspl.viability.grid import Grid
 
 _KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
@@ -44,9 +50,12 @@ _SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerate
 _KEPT_OF_SAFE = 0.9
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data tolerates
+_GRID_ROOM = 4.0  # ... that the one on a grid tolerates
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
-_WEIGHT = 2.0  # of counterexamples
+_WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
 _MEMORY = 17  # nodes of the grid per entry that no picture shows
+_SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
+_NEAR_ZERO = 0.06  # of these targets, those that a batch has as many of as of all
 _DEPTH = 0.25  # barrier value up to which the targets on a grid go
 _POOL = 8192  # counterexamples that are kept
 _UNROLLED = 24  # steps through the observer
@@ -75,6 +84,8 @@ class Gather(Phase):
             parts = [] if stored is None else [stored]
             if missing > 0 and (source.known or stored is None):
                 parts.append(source.random(missing, 0))
+            if s.grid and source.known and s.rim_transitions:  # what lies between pictures of U has to be known, too
+                parts.append(source.random(s.rim_transitions, 5, region=source.env.unsafe_set, steps=1))
             if work.observing and source.known:
                 parts.append(self._rollouts(work, 15, gain_matrix(1.0, work.latent_dim, work.seen_dim)))
         else:
@@ -219,6 +230,7 @@ class TeachPolicy(_Training):
 class FitSets(_Training):
     """Barrier and policy onto the robust invariant set of the encoded data.
 
+    Targets on a grid are exact: half of a batch comes from where they are near zero, and pictures of U count, too.
     Source: none; the paper trains the barrier on the condition from the start.
     """
 
@@ -226,11 +238,18 @@ class FitSets(_Training):
 
     def run(self, work: Workspace) -> None:
         table, _ = targets(work, self.number)
+        s, g, pick = work.config, bool(work.config.grid), work.loop.pick
         loss = TargetLoss(
-            work.barrier, work.policy, action_scale=work.action_scale, scale=0.1, worst_coeff=0.3, worst_fraction=0.05
-        )
+            work.barrier, work.policy, action_scale=work.action_scale, scale=0.1, worst_coeff=1.0 if g else 0.3,
+            worst_fraction=0.02 if g else 0.05, safety_margin=s.unsafe_margin, unsafe_coeff=float(g),
+        )  # fmt: skip
         rates = {work.barrier: 5e-3 if self.number == 0 else 2e-3, work.policy: 3e-3}
-        work.loop(self.size(work), rates, lambda: loss(table[work.loop.pick(len(table), work.config.batch)]))
+        shares = [(torch.arange(len(table)), s.batch)]
+        if g:
+            near = table["barrier_target"][:, 0].abs() < _NEAR_ZERO
+            unsafe = table["region"][:, 0] == UNSAFE
+            shares += [(rows.nonzero()[:, 0], n) for rows, n in ((near, s.batch), (unsafe, s.batch // 2)) if bool(rows.any())]
+        work.loop(self.size(work), rates, lambda: loss(table[torch.cat([rows[pick(len(rows), n)] for rows, n in shares])]))
 
 
 class FineTune(_Training):
@@ -287,7 +306,7 @@ class FineTune(_Training):
         """Further terms of a step."""
         return {}
 
-    def _losses(self, work: Workspace) -> tuple[SynthesisLoss, TargetLoss]:
+    def _losses(self, work: Workspace, safe_coeff: float = 1.0) -> tuple[SynthesisLoss, TargetLoss]:
         s = work.config
         condition = SynthesisLoss(
             None, work.dynamics, work.barrier, work.acting, mode="R3", dynamics_margin=self.margin(s), band=s.band,
@@ -295,7 +314,7 @@ class FineTune(_Training):
         )  # fmt: skip
         target = TargetLoss(
             work.barrier, work.policy, action_scale=work.action_scale, outside_cap=s.band, policy_coeff=s.recovery_coeff,
-            safety_margin=s.unsafe_margin, inside_coeff=2.0, unsafe_coeff=10.0, safe_coeff=1.0, worst_coeff=1.0,
+            safety_margin=s.unsafe_margin, inside_coeff=2.0, unsafe_coeff=10.0, safe_coeff=safe_coeff, worst_coeff=1.0,
             worst_fraction=0.02,
         )  # fmt: skip
         return condition, target
@@ -378,6 +397,53 @@ class Tighten(FineTune):
         return z[worst.indices[worst.values > -0.01]]
 
 
+class Settle(Tighten):
+    """The smallest change after which no counterexample is found; for targets on a grid, which are nearly kept as they are fitted.
+
+    Of the pictures of U those count that the barrier puts lowest, whatever action the memory holds.
+    Source: none (counterexample-guided synthesis).
+    """
+
+    def run(self, work: Workspace) -> None:
+        s, pick = work.config, work.loop.pick
+        if work.loop.step == 0:
+            work.counterexamples = torch.zeros(0, work.latent_dim)
+        self._loss = CounterexampleLoss(
+            work.dynamics, work.barrier, work.acting, mode="least", depth=_SPARE, dynamics_margin=_SPARE, error=s.tolerated_error,
+            worst_coeff=0.3, worst_fraction=0.02,
+        )  # fmt: skip
+        table, rim = targets(work, self.number)
+        unsafe, safe = ((table["region"][:, 0] == code).nonzero()[:, 0] for code in (UNSAFE, SAFE))
+        _, target = self._losses(work, safe_coeff=0.0)  # S may reach to the border of what can be kept: no margin is asked there
+
+        def lowest(rows: Tensor) -> TensorDict:
+            drawn = rows[pick(len(rows), 4 * s.batch)]
+            latent = table["latent"][drawn]
+            if work.seen_dim is not None:
+                latent = remembered(work, latent, work.loop.generator)
+            with torch.no_grad():
+                found = work.barrier(latent)[:, 0].topk(s.batch // 2, largest=False).indices
+            return table[drawn[found]].set("latent", latent[found])
+
+        def step() -> dict[str, Tensor]:
+            if work.loop.step % 100 == 0:
+                work.counterexamples = self._search(work, rim["latent"])
+            asked = [rim["latent"][pick(len(rim), s.batch)]]
+            if len(work.counterexamples):
+                asked.append(work.counterexamples[pick(len(work.counterexamples), s.batch)])
+            latent = torch.cat(asked)
+            terms = dict(self._loss(TensorDict(latent=latent, batch_size=[len(latent)])).items())
+            terms["loss_counterexample"] = _LEAST_WEIGHT * terms["loss_counterexample"]
+            drawn = [table[pick(len(table), s.batch)], lowest(unsafe)]
+            terms |= dict(target(torch.cat(drawn)).items())
+            if len(safe):
+                missed = safe_hinge(work.barrier(table["latent"][safe[pick(len(safe), s.batch)]]), _SPARE)
+                terms["loss_safe"] = _LEAST_WEIGHT * missed.mean()
+            return terms
+
+        work.loop(self.size(work), self.rates(work), step)
+
+
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
     """The phases of every round.
 
@@ -393,7 +459,8 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
     """
     teach = [TeachPolicy] if config.teacher == "value" else []
     tighten = [Tighten] if config.tolerated_error > 0 else []
-    kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, SteerPolicy, FineTune, *tighten, *([check] if check else [])]
+    after = [Settle] if config.grid else [SteerPolicy, FineTune, *tighten]
+    kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, *after, *([check] if check else [])]
     return [kind(k) for k in range(config.rounds) for kind in kinds]
 
 
@@ -482,7 +549,7 @@ def targets(work: Workspace, number: int) -> tuple[TensorDict, TensorDict]:
         g = torch.Generator().manual_seed(work.seed + 88_000 + number)
         z, region = data["latent"], data["region"]
         if work.seen_dim is not None:  # a label is about a picture, whatever the memory holds beside it
-            z, region = torch.cat([z, remembered(work, z, g)]), torch.cat([region, region])
+            z, region = torch.cat([z, remembered(work, data["seen"], g)]), torch.cat([torch.zeros_like(region), region])
         unsafe = region[:, 0] == UNSAFE
         zc = z[~unsafe]
         near, axes = observed_errors(work, zc, g, s.residual_spread)
@@ -552,20 +619,33 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     looks_unsafe, room = z[unsafe][:, :seen], max(s.guard, 1.0 / (s.grid - 1))  # at least half of a cell
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * seen).reshape(-1, seen)
     length = signs.norm(dim=1, keepdim=True).clamp_min(1.0)
-    errors = torch.nn.functional.pad(_ROOM * s.tolerated_error * signs / length, (0, p - seen))
+    errors = torch.nn.functional.pad(_GRID_ROOM * s.tolerated_error * signs / length, (0, p - seen))
     found = viability_kernel(
         work.dynamics, low=[-1.0] * p, high=[1.0] * p, resolution=[s.grid] * seen + [_MEMORY] * (p - seen), errors=errors,
         margin=lambda x: nearest_distance(x[:, :seen], looks_unsafe) - room, actions=action_grid(work.action_scale, s.choices or s.actions),
         exit_is_safe=False,
     )  # fmt: skip
-    nodes, inside = found.grid.nodes(), found.value.flatten() > 0.0
-    if not bool(inside.any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
-        inside = found.margin.flatten() > 0.0
-    distance = nearest_distance(queries, nodes[inside]) - nearest_distance(queries, nodes[~inside])
-    target = (0.9 * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
+    if not bool((found.value > 0.0).any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
+        found = replace(found, value=found.margin)
+    distance = _signed_distance(found, queries)
+    target = (_SLOPE * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
     work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
     work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
     return target, target <= 0.0, taught(z), torch.ones(len(z))
+
+
+def _signed_distance(found: ViabilityKernel, queries: Tensor) -> Tensor:
+    """Distance of queries ``(n, d)`` to a set on a grid, ``(n,)``, negative inside: exact at the nodes of a grid twice as fine, on which
+    the values are interpolated, and interpolated between them."""
+    fine = Grid(found.grid.low, found.grid.high, [2 * n - 1 for n in found.grid.shape])
+    inside = (found.interpolate(fine.nodes()) > 0.0).reshape(fine.shape).numpy()
+    if inside.all() or not inside.any():
+        return torch.full((len(queries),), -math.inf if inside.all() else math.inf)
+    half = 0.5 * fine.step[0]  # the border lies between two nodes
+    outer, inner = (distance_transform_edt(part, sampling=fine.step) for part in (~inside, inside))
+    distance = np.where(inside, half - inner, outer - half)
+    index, within, _ = fine.locate(queries)
+    return fine.gather(fine.pad(torch.from_numpy(distance).float()), index, within)
 
 
 @torch.no_grad()
@@ -593,5 +673,5 @@ def _value_targets(work: Workspace, z: Tensor, region: Tensor, queries: Tensor, 
 
 
 __all__ = [
-    "FineTune", "FitDynamics", "FitSets", "Gather", "SteerPolicy", "TeachPolicy", "Tighten", "action_grid", "synthesis_phases",
+    "FineTune", "FitDynamics", "FitSets", "Gather", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "action_grid", "synthesis_phases",
 ]
