@@ -1,12 +1,12 @@
 """auto_LiRPA beside our own bounds: the shipped [V] decided with its bounds alone, and both on random networks.
 
-Run: python benchmarks/lirpa.py SOURCE [agent=pendulum] [seconds=3600] [networks=200]
+Run: python benchmarks/lirpa.py SOURCE [agent=pendulum] [seconds=3600] [networks=200] [turned=0]
 
 SOURCE is a checkout of https://github.com/Verified-Intelligence/auto_LiRPA (the release on the package index is of 2022 and imports
 with no torch of today; it needs `pip install appdirs graphviz`). [V] is read from the ONNX file of `export_vnnlib`. A box of the latent
 domain is settled when auto_LiRPA's CROWN bounds say that B > 0 on all of it, or that B of the successor is below 0 on all of it; every
 other one is cut in two across its longest side. A centre that is a real counterexample ends the search. Nothing of
-`torchrl_sspl.certification` but the export takes part.
+`torchrl_sspl.certification` but the export takes part. `turned=1` turns the sign of the policy round, of which [V] has to be refuted.
 """
 
 from __future__ import annotations
@@ -77,24 +77,30 @@ def bounded(lirpa: Any, network: nn.Module, size: int) -> Any:
     return bounds
 
 
-def decide(lirpa: Any, agent: str = "pendulum", seconds: float = 3600.0) -> dict[str, Any]:
+def decide(lirpa: Any, agent: str, seconds: float, turned: bool) -> dict[str, Any]:
     """Whether [V] holds by auto_LiRPA's bounds: share of the domain that is settled, boxes, seconds."""
     loaded = load(agent)
     parts = [getattr(net, "module", net) for net in (loaded.barrier, loaded.dynamics, loaded.policy)]
+    if turned:
+        layer = [m for m in parts[2].modules() if isinstance(m, nn.Linear)][-1]
+        for parameter in layer.parameters():
+            parameter.data.neg_()
     system = closed_loop(*parts, latent_dim=loaded.latent_dim, lipschitz_bound=loaded.lipschitz_bound)
     network, _ = export_vnnlib(system, tempfile.mkdtemp())
     net, p, start = FromOnnx(str(network)), loaded.latent_dim, time.time()
     bounds, boxes, settled = bounded(lirpa, net, p), 0, 0.0
+    # Of a policy that chooses: its own action is not accepted, and none of the table keeps the set.
+    least = torch.tensor([system.accepted, *[0.0] * (len(system.inner) - 1)] if system.chooses else [0.0])
     cells = torch.cartesian_prod(*[torch.arange(-1.0, 1.0, 0.25)] * p)
     todo = [(a, a + 0.25) for a in cells.split(BATCH)]
     bar = tqdm(total=1.0, unit="of the domain")
     while todo and time.time() - start < seconds:
         low, high = todo.pop()
-        now, then = net((low + high) / 2)[:, :2].unbind(1)
-        if bool(((now <= 0.0) & (then >= 0.0)).any()):
+        value = net((low + high) / 2)
+        if bool(((value[:, 0] <= 0.0) & (value[:, 1:] >= least).all(1)).any()):
             return {"verdict": "refuted", "boxes": boxes, "seconds": round(time.time() - start)}
-        least, most = bounds(low, high)
-        done = (least[:, 0] > 0.0) | (most[:, 1] < 0.0)
+        lower, upper = bounds(low, high)
+        done = (lower[:, 0] > 0.0) | (upper[:, 1:] < least).any(1)
         boxes += len(low)
         share = float((high - low)[done].prod(1).sum()) / 2**p
         settled += share
@@ -110,7 +116,7 @@ def decide(lirpa: Any, agent: str = "pendulum", seconds: float = 3600.0) -> dict
     return {"verdict": verdict, "settled": settled, "boxes": boxes, "seconds": round(time.time() - start)}
 
 
-def compare(lirpa: Any, networks: int = 200) -> dict[str, Any]:
+def compare(lirpa: Any, networks: int) -> dict[str, Any]:
     """Upper bounds of random ReLU networks on random boxes: ours over theirs, and whether a value found lies above either."""
     ratios: list[float] = []
     exceeded = {"ours": 0, "theirs": 0}
@@ -140,7 +146,7 @@ def compare(lirpa: Any, networks: int = 200) -> dict[str, Any]:
     return {"boxes": len(ratios), "exceeded": exceeded, "width, ours over theirs (1 %, median, 99 %)": spread}
 
 
-def main(source: str, *, agent: str = "pendulum", seconds: float = 3600.0, networks: int = 200) -> dict[str, Any]:
+def main(source: str, *, agent: str = "pendulum", seconds: float = 3600.0, networks: int = 200, turned: int = 0) -> dict[str, Any]:
     """Both."""
     # It takes two names of numpy that are gone.
     vars(np).update(Inf=np.inf)
@@ -149,9 +155,8 @@ def main(source: str, *, agent: str = "pendulum", seconds: float = 3600.0, netwo
     warnings.simplefilter("ignore")
     import auto_LiRPA
 
-    found = compare(auto_LiRPA, networks)
-    print(found, flush=True)
-    return found | decide(auto_LiRPA, agent, seconds)
+    found = compare(auto_LiRPA, networks) if networks else {}
+    return found | decide(auto_LiRPA, agent, seconds, bool(turned))
 
 
 if __name__ == "__main__":
