@@ -123,7 +123,7 @@ def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_pat
         def forward(self, latent, action):
             return (latent + 0.2 * action).clamp(-1, 1)
 
-    work = experiment(tmp_path, "synthesis.choices=2", "synthesis.grid=401", "synthesis.tolerated_error=0.04", "synthesis.guard=0.0").work
+    work = experiment(tmp_path, "synthesis.choices=2", "synthesis.grid=401", "synthesis.tolerated_error=0.02", "synthesis.guard=0.0").work
     work.networks["dynamics"] = Line()
     work.originals["dynamics"], work.taught, work.seen_dim = Line(), lambda z: torch.zeros(len(z), 1), None
     z = torch.linspace(-1, 1, 401)[:, None]
@@ -134,7 +134,7 @@ def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_pat
     assert target[3] == target[4] == -0.25
     assert action.shape == (401, 1)
     assert 0.9 < work.kept_share <= 1.0
-    assert asked["errors"].flatten().tolist() == pytest.approx([-0.08, 0.0, 0.08])  # twice what is to be tolerated
+    assert asked["errors"].flatten().tolist() == pytest.approx([-0.08, 0.0, 0.08])  # four times what is to be tolerated
     assert asked["actions"].tolist() == [[-1.0], [1.0]]
 
 

@@ -171,8 +171,8 @@ class SynthesisConfig:
     tube_radius: float = _option(0.3, "distance from the data up to which a latent off the manifold may belong to the "
         "safe set.")
     grid: int = _option(0, "nodes per entry that pictures show of a grid over the latent domain, on which the barrier's targets are found "
-        "by dynamic programming, under tolerated_error and with the actions of choices; for latents that the data fill. 0: the targets "
-        "are found on the cloud of the data.")
+        "by dynamic programming, under four times tolerated_error and with the actions of choices; for latents that the data fill. 0: the "
+        "targets are found on the cloud of the data.")
     tolerated_error: float = _option(0.0, "error per step that the set is meant to be proved to tolerate, latent units: the "
         "invariant set of the data keeps a quarter more, the fine-tuning asks the condition under the worst error of this size, and "
         "then the counterexamples of the proof go back into the training. 0: residual_spread counts, and nothing is asked of the proof.")
