@@ -5,20 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from plain import linear
 from torch import Tensor, nn
 
 from torchrl_sspl.lipschitz import lipschitz_upper
 from torchrl_sspl.modules import ChoosingPolicy, LatentDynamics, Policy
 
 LEFT_OR_RIGHT = [[-2.0], [2.0]]
-
-
-def linear(weight: Any, bias: Any = None) -> nn.Linear:
-    weight = torch.as_tensor(weight, dtype=torch.float32)
-    layer = nn.Linear(weight.shape[1], weight.shape[0])
-    layer.weight.data.copy_(weight)
-    layer.bias.data.copy_(torch.zeros(len(weight)) if bias is None else torch.as_tensor(bias, dtype=torch.float32))
-    return layer.requires_grad_(False)
 
 
 def with_net(module: nn.Module, *layers: nn.Module) -> nn.Module:

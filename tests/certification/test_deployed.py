@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 import torch
+from plain import linear
 from torch import Tensor, nn
 from torch.nn.utils import parametrizations, parametrize
 
@@ -20,14 +21,6 @@ from torchrl_sspl.errors import StructureError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.lipschitz.layers import FORMS, LAYERS, ORIGINAL, Activation, known_form
 from torchrl_sspl.modules import LatentDynamics, Policy
-
-
-def linear(weight: Any, bias: Any = None) -> nn.Linear:
-    weight = torch.as_tensor(weight, dtype=torch.float32)
-    layer = nn.Linear(weight.shape[1], weight.shape[0])
-    layer.weight.data.copy_(weight)
-    layer.bias.data.copy_(torch.zeros(len(weight)) if bias is None else torch.as_tensor(bias, dtype=torch.float32))
-    return layer.requires_grad_(False)
 
 
 def with_net(module: nn.Module, net: nn.Module) -> nn.Module:

@@ -14,6 +14,7 @@ import pytest
 import test_forgeries
 import torch
 from analytic import Line, line_agent
+from plain import linear
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
@@ -29,14 +30,6 @@ from torchrl_sspl.evaluation.certify import Exit, certify, verify_run
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.modules.agent import Agent, load
 from torchrl_sspl.seeds import spawn
-
-
-def linear(weight: Any, bias: Any = None) -> nn.Linear:
-    weight = torch.as_tensor(weight, dtype=torch.float32)
-    layer = nn.Linear(weight.shape[1], weight.shape[0])
-    layer.weight.data.copy_(weight)
-    layer.bias.data.copy_(torch.zeros(len(weight)) if bias is None else torch.as_tensor(bias, dtype=torch.float32))
-    return layer.requires_grad_(False)
 
 
 def residual(net: nn.Sequential, action_scale: float = 2.0) -> LatentDynamics:
