@@ -2,8 +2,8 @@
 
 Run: python benchmarks/lirpa.py SOURCE [agent=pendulum] [seconds=3600] [networks=200] [turned=0]
 
-SOURCE is a checkout of https://github.com/Verified-Intelligence/auto_LiRPA (the release on the package index is of 2022 and imports
-with no torch of today; it needs `pip install appdirs graphviz`). [V] is read from the ONNX file of `export_vnnlib`. A box of the latent
+SOURCE is a checkout of https://github.com/Verified-Intelligence/auto_LiRPA (its release 0.3 does not import with the
+torch of today; `pip install appdirs graphviz`). [V] is read from the ONNX file of `export_vnnlib`. A box of the latent
 domain is settled when auto_LiRPA's CROWN bounds say that B > 0 on all of it, or that B of the successor is below 0 on all of it; every
 other one is cut in two across its longest side. A centre that is a real counterexample ends the search. Nothing of
 `torchrl_sspl.certification` but the export takes part. `turned=1` turns the sign of the policy round, of which [V] has to be refuted.
@@ -38,15 +38,13 @@ class FromOnnx(nn.Module):
 
     def __init__(self, path: str) -> None:
         super().__init__()
-        self.nodes = list(onnx.load(path).graph.node)
-        for constant in onnx.load(path).graph.initializer:
+        graph = onnx.load(path).graph
+        self.nodes = list(graph.node)
+        matrices = {node.input[1] for node in self.nodes if node.op_type == "MatMul"}
+        for constant in graph.initializer:
             value = torch.tensor(numpy_helper.to_array(constant))
-            # Without the dimension of the batch, as auto_LiRPA wants its constants.
-            self.register_buffer(constant.name, value[0] if len(value) == 1 and value.ndim == 2 else value)
-        used = {n.input[1] for n in self.nodes if n.op_type == "MatMul"}
-        for name in used:  # a matrix with one row is none of these
-            matrix = getattr(self, name)
-            setattr(self, name, matrix[None] if matrix.ndim == 1 else matrix)
+            # What is added comes without the dimension of the batch, as auto_LiRPA wants it.
+            self.register_buffer(constant.name, value if constant.name in matrices else value[0])
 
     def forward(self, x: Tensor) -> Tensor:
         """B of latents ``(n, p)``, then of their successors."""
@@ -93,7 +91,7 @@ def decide(lirpa: Any, agent: str, seconds: float, turned: bool) -> dict[str, An
     least = torch.tensor([system.accepted, *[0.0] * (len(system.inner) - 1)] if system.chooses else [0.0])
     cells = torch.cartesian_prod(*[torch.arange(-1.0, 1.0, 0.25)] * p)
     todo = [(a, a + 0.25) for a in cells.split(BATCH)]
-    bar = tqdm(total=1.0, unit="of the domain")
+    bar = tqdm(total=1.0, unit=" of the domain")
     while todo and time.time() - start < seconds:
         low, high = todo.pop()
         value = net((low + high) / 2)

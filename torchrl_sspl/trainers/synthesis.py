@@ -277,7 +277,11 @@ class FineTune(_Training):
         safe = (table["region"][:, 0] == SAFE).nonzero()[:, 0]
         table = table.clone(False)
         table["action_weight"] = table["action_weight"] * torch.where(table["inside"], 0.1, 1.0)
-        condition, target = self._losses(work)
+        condition = SynthesisLoss(
+            None, work.dynamics, work.barrier, work.acting, mode="R3", dynamics_margin=self.margin(s), band=s.band,
+            worst_coeff=1.0, worst_fraction=0.02, off_manifold_coeff=1.0,
+        )  # fmt: skip
+        target = self._target(work)
         # What the sets hold counts more than its share of the data; S may be empty.
         shares = ((unsafe, s.batch // 2), (unsafe[nearest], s.batch // 2), (safe, s.batch // 4))
         pick = work.loop.pick
@@ -306,18 +310,13 @@ class FineTune(_Training):
         """Further terms of a step."""
         return {}
 
-    def _losses(self, work: Workspace, safe_coeff: float = 1.0) -> tuple[SynthesisLoss, TargetLoss]:
+    def _target(self, work: Workspace, safe_coeff: float = 1.0) -> TargetLoss:
         s = work.config
-        condition = SynthesisLoss(
-            None, work.dynamics, work.barrier, work.acting, mode="R3", dynamics_margin=self.margin(s), band=s.band,
-            worst_coeff=1.0, worst_fraction=0.02, off_manifold_coeff=1.0,
-        )  # fmt: skip
-        target = TargetLoss(
+        return TargetLoss(
             work.barrier, work.policy, action_scale=work.action_scale, outside_cap=s.band, policy_coeff=s.recovery_coeff,
             safety_margin=s.unsafe_margin, inside_coeff=2.0, unsafe_coeff=10.0, safe_coeff=safe_coeff, worst_coeff=1.0,
             worst_fraction=0.02,
         )  # fmt: skip
-        return condition, target
 
     def _with_counterexamples(self, work: Workspace, asked: TensorDict) -> TensorDict:
         """Adds latents of the whole domain at which the condition fails; they are searched for again and again."""
@@ -414,7 +413,7 @@ class Settle(Tighten):
         )  # fmt: skip
         table, rim = targets(work, self.number)
         unsafe, safe = ((table["region"][:, 0] == code).nonzero()[:, 0] for code in (UNSAFE, SAFE))
-        _, target = self._losses(work, safe_coeff=0.0)  # S may reach to the border of what can be kept: no margin is asked there
+        target = self._target(work, safe_coeff=0.0)  # S may reach to the border of what can be kept: no margin is asked there
 
         def lowest(rows: Tensor) -> TensorDict:
             drawn = rows[pick(len(rows), 4 * s.batch)]
