@@ -23,8 +23,8 @@ from torchrl_sspl.certification.record import NOTHING, Record
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.evaluation import certify as certify_module
-from torchrl_sspl.evaluation.blocks import Block
-from torchrl_sspl.evaluation.certify import Exit, _block_changes, certify, verify_run
+from torchrl_sspl.evaluation.blocks import Block, block_changes
+from torchrl_sspl.evaluation.certify import Exit, certify, verify_run
 from torchrl_sspl.modules.agent import Agent
 
 
@@ -508,6 +508,6 @@ def test_a_step_may_be_rounded_away_only_where_episodes_end_early(change, refuse
     steps, none = torch.tensor([200, 100, 400]), torch.zeros(0)
     block = Block(found, found, 0, none, steps, [], [], {}, none, none, none, none, none)
     claimed = replace(found, **{k: getattr(found, k) + v for k, v in change.items()})
-    assert bool(_block_changes(claimed, block, resets=False)) is refused
+    assert bool(block_changes(claimed, block, resets=False)) is refused
     whole = replace(block, steps=torch.full((3,), 400))
-    assert bool(_block_changes(claimed, whole, resets=False)) is bool(change)
+    assert bool(block_changes(claimed, whole, resets=False)) is bool(change)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -26,6 +26,7 @@ from torchrl_sspl.modules.controller import premise_met
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE
 
+_LATE = 200  # one step in so many may be another on another machine, where episodes end early
 _COVERED = 4000  # observations of which a covering radius is computed, from an environment's own resets
 _BARELY = 1e-4  # of the barrier's range: a decision closer than this may be rounded to the other side elsewhere
 _GRID = 2.0**-19  # below which two trajectories are the same: networks round differently in different batches
@@ -373,3 +374,41 @@ def summarise(record: Record, blocks: Sequence[Block], agent: Agent) -> None:
         found = [b.rims[name] for b in blocks if name in b.rims]
         if found:
             record.rims.append((name, sum(k for k, _ in found), max(e for _, e in found)))
+
+
+def block_changes(claimed: Counts, block: Block, resets: bool) -> str:
+    """Counts that are better than those measured again, but for what another machine may round away."""
+    found, least, close = asdict(block.counts), asdict(block.least), block.close
+    longest = int(block.steps.max()) if len(block.steps) else 0
+    # A pixel that is rounded elsewhere may lead an episode along another path, out of the domain a step earlier or later.
+    late = math.ceil(int(block.steps[block.steps < longest].sum()) / _LATE)
+    moved = close * (longest + 1) + (2 * late if resets else 0)
+    slack = {"episodes": close, "shown": close, "steps": close * longest + late, "seen": moved}
+    wrong = [k for k, most in slack.items() if abs(getattr(claimed, k) - found[k]) > most]
+    events = ("left", "entered", "aliased", "undefined", "events", "exceeding", "uncovered", "mistaken", "outside")
+    fewer = {"uncovered": max(found["steps"] - claimed.steps, 0)}  # a step less is no step covered more
+    wrong += [k for k in events if getattr(claimed, k) < max(least[k], found[k] - 1) - fewer.get(k, 0)]
+    return ", ".join(f"{k} claimed {getattr(claimed, k)}, measured {found[k]}" for k in wrong)
+
+
+def summary_changes(claimed: Record, found: Record, close: int) -> str:
+    """Numbers beside the counts that are not those measured again."""
+    wrong = []
+    for name, value in claimed.sizes.items():
+        few = name in ("repeated", "leaked")
+        slack = close + (2 if few else max(2, found.sizes[name] // 500))
+        if not value >= found.sizes[name] - slack or (not few and value > found.sizes[name] + slack):
+            wrong.append(f"{name} claimed {value}, measured {found.sizes[name]}")
+    for key, number in claimed.numbers.items():
+        other = found.numbers[key]
+        if (number is None) != (other is None) or (
+            number is not None and other is not None and not math.isclose(number, other, rel_tol=1e-2, abs_tol=1e-6)
+        ):
+            wrong.append(f"{key} claimed {number}, measured {other}")
+    if [r[0] for r in claimed.rims] != [r[0] for r in found.rims] or any(
+        abs(a[1] - b[1]) > close * claimed.horizon + max(3, b[1] // 100)
+        or not math.isclose(a[2], b[2], rel_tol=1e-2, abs_tol=1e-6)
+        for a, b in zip(claimed.rims, found.rims, strict=True)
+    ):
+        wrong.append("errors by part of the set")
+    return "; ".join(wrong)

@@ -11,7 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ from torchrl_sspl.certification.certificate import (
 from torchrl_sspl.certification.conditions import closed_loop, tolerates
 from torchrl_sspl.certification.floating import UNITS
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
-from torchrl_sspl.certification.record import Counts, Record
+from torchrl_sspl.certification.record import Record
 from torchrl_sspl.certification.rounding import missed, shown
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
@@ -45,11 +45,13 @@ from torchrl_sspl.evaluation.blocks import (
     MakeEnv,
     ResetBlocks,
     StateBlocks,
+    block_changes,
     described_system,
     holds_at,
     same_resets,
     same_system,
     summarise,
+    summary_changes,
 )
 from torchrl_sspl.modules.agent import Agent, agent_directory
 from torchrl_sspl.modules.choosing import ChoosingPolicy
@@ -62,8 +64,6 @@ _CERTIFIED_KEYS = ("networks", "config", "training", "lipschitz", "seeds", "envi
 
 #: More than a correction that is cut to a length, computed in float32, is longer than that: 2^-22 an entry of up to ten, of [-1, 1].
 _CUT = 1e-6
-#: One step in so many may be another on another machine, where episodes end early.
-_LATE = 200
 #: How far beyond the Lipschitz argument a tolerated error is looked for, in how many steps, and with how many boxes each.
 _FARTHEST, _HALVINGS, _PATIENCE = 1.7, 4, 50_000
 _ROUNDINGS = ("barrier_rounding", "step_rounding")
@@ -514,7 +514,7 @@ def _measured_again(
     try:
         for index in order:
             blocks[index] = source(index)
-            changes = _block_changes(record.blocks[index], blocks[index], record.kind == "resets")
+            changes = block_changes(record.blocks[index], blocks[index], record.kind == "resets")
             if changes:
                 _refuse({Reason.RECORD_CHANGED: f"block {index}: {changes}"})
             if (time.monotonic() - began) * (1 + 1 / len(blocks)) > seconds and len(blocks) < len(order):
@@ -525,48 +525,10 @@ def _measured_again(
         return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random"
     fresh = replace(record, blocks=list(record.blocks), sizes={}, numbers={}, rims=[])
     summarise(fresh, [blocks[k] for k in sorted(blocks)], agent)
-    changes = _summary_changes(record, fresh, sum(b.close for b in blocks.values()))
+    changes = summary_changes(record, fresh, sum(b.close for b in blocks.values()))
     if changes:
         _refuse({Reason.RECORD_CHANGED: changes})
     return ""
-
-
-def _block_changes(claimed: Counts, block: Block, resets: bool) -> str:
-    """Counts that are better than those measured again, but for what another machine may round away."""
-    found, least, close = asdict(block.counts), asdict(block.least), block.close
-    longest = int(block.steps.max()) if len(block.steps) else 0
-    # A pixel that is rounded elsewhere may lead an episode along another path, out of the domain a step earlier or later.
-    late = math.ceil(int(block.steps[block.steps < longest].sum()) / _LATE)
-    moved = close * (longest + 1) + (2 * late if resets else 0)
-    slack = {"episodes": close, "shown": close, "steps": close * longest + late, "seen": moved}
-    wrong = [k for k, most in slack.items() if abs(getattr(claimed, k) - found[k]) > most]
-    events = ("left", "entered", "aliased", "undefined", "events", "exceeding", "uncovered", "mistaken", "outside")
-    fewer = {"uncovered": max(found["steps"] - claimed.steps, 0)}  # a step less is no step covered more
-    wrong += [k for k in events if getattr(claimed, k) < max(least[k], found[k] - 1) - fewer.get(k, 0)]
-    return ", ".join(f"{k} claimed {getattr(claimed, k)}, measured {found[k]}" for k in wrong)
-
-
-def _summary_changes(claimed: Record, found: Record, close: int) -> str:
-    """Numbers beside the counts that are not those measured again."""
-    wrong = []
-    for name, value in claimed.sizes.items():
-        few = name in ("repeated", "leaked")
-        slack = close + (2 if few else max(2, found.sizes[name] // 500))
-        if not value >= found.sizes[name] - slack or (not few and value > found.sizes[name] + slack):
-            wrong.append(f"{name} claimed {value}, measured {found.sizes[name]}")
-    for key, number in claimed.numbers.items():
-        other = found.numbers[key]
-        if (number is None) != (other is None) or (
-            number is not None and other is not None and not math.isclose(number, other, rel_tol=1e-2, abs_tol=1e-6)
-        ):
-            wrong.append(f"{key} claimed {number}, measured {other}")
-    if [r[0] for r in claimed.rims] != [r[0] for r in found.rims] or any(
-        abs(a[1] - b[1]) > close * claimed.horizon + max(3, b[1] // 100)
-        or not math.isclose(a[2], b[2], rel_tol=1e-2, abs_tol=1e-6)
-        for a, b in zip(claimed.rims, found.rims, strict=True)
-    ):
-        wrong.append("errors by part of the set")
-    return "; ".join(wrong)
 
 
 def _print(claimed: Certificate, unmeasured: str, report: Callable[[str], None]) -> None:
