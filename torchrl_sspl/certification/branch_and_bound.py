@@ -64,6 +64,8 @@ class Problem:
     lipschitz: float | None = None  # proved Lipschitz constant of B
     inner: tuple[int, ...] = ()  # steps of F, one for each output, that hold d(z, u) where this output is B of it
     error: float = 0.0  # Euclidean norm up to which anything may be added to the only one of these, as long as it stays in the domain
+    behind: Graph | None = None  # B of what these steps hold, where that is no point of the domain but a latent whose chart is one
+    within: Callable[[Tensor], Tensor] | None = None  # the nearest of these
 
     @property
     def constrained(self) -> bool:
@@ -77,11 +79,19 @@ class Problem:
             after = self.function.values(point)[self.inner[0]]
             with torch.enable_grad():
                 at = after.detach().requires_grad_()
-                (slope,) = torch.autograd.grad(self.barrier(at).sum(), at)
-            moved = after + self.error * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
-            value = self.barrier(torch.minimum(torch.maximum(moved, self.low), self.high))
+                (slope,) = torch.autograd.grad(self.after(at).sum(), at)
+            # A thousandth less: what goes back onto a circle may go a little farther.
+            length = self.error if self.within is None else 0.999 * self.error
+            moved = after + length * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-12)
+            inside = torch.minimum(torch.maximum(moved, self.low), self.high) if self.within is None else self.within(moved)
+            value = self.after(inside)
             return self.combined(value @ self.rows.mT - barrier * self.barrier_weight + self.constant), barrier[:, 0]
         return self.combined(self.function(point) @ self.rows.mT - barrier * self.barrier_weight + self.constant), barrier[:, 0]
+
+    @property
+    def after(self) -> Graph:
+        """B of what a step leads to."""
+        return self.barrier if self.behind is None else self.behind
 
     def combined(self, parts: Tensor) -> Tensor:
         """Objective from its rows ``(n, K)``."""
@@ -249,7 +259,7 @@ def _bound(
     if q.inner and q.lipschitz is not None:
         least, most = (torch.stack(ends, 1) for ends in zip(*(inner.interval(k) for k in q.inner), strict=True))
         reach = q.lipschitz * ((0.5 * (most - least)).norm(dim=2) + q.error)
-        middle = q.barrier(0.5 * (least + most).flatten(0, 1)).reshape(reach.shape)
+        middle = q.after(0.5 * (least + most).flatten(0, 1)).reshape(reach.shape)
         first = (middle + reach) @ q.rows.mT + q.constant
         if below is not None and bool(q.barrier_weight.any()):
             first = first + q.barrier_weight * below.at(inner.center).upper(inner.radius)

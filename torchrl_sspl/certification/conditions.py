@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, cast
 
 import torch
@@ -18,9 +19,10 @@ from torch import Tensor, nn
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, Outcome, Problem, maximise
 from torchrl_sspl.certification.floating import largest_rounding, rounding_bound
 from torchrl_sspl.certification.graph import Apply, Graph
+from torchrl_sspl.direction import Direction, direction_of, within
 from torchrl_sspl.errors import ConfigError, StructureError
 from torchrl_sspl.lipschitz import lipschitz_upper
-from torchrl_sspl.lipschitz.layers import FORMS, Activation, clamp
+from torchrl_sspl.lipschitz.layers import FORMS, Activation, clamp, sine
 from torchrl_sspl.lipschitz.network import check_module, flat_layers
 
 _SCALES = (1e-10, 1e10)
@@ -34,7 +36,8 @@ class ClosedLoop:
     r"""Frozen networks in the form in which bounds propagate through them; made by :func:`closed_loop`.
 
     Attributes:
-        barrier: B, ``(n, p) -> (n, 1)``.
+        barrier: B, ``(n, p) -> (n, 1)``. Of latents that hold a direction, this and all below are functions of their charts
+            ``(n, p - 1)``, and the domain is that of the charts.
         step: :math:`d(z, \pi(z))`, ``(n, p) -> (n, p)``; of a policy that chooses, for its own action and each of the table,
             ``(n, (1 + K) p)``.
         looped: :math:`B(d(z, \pi(z)))`, ``(n, p) -> (n, 1)``; of a policy that chooses ``(n, 1 + K)``.
@@ -53,10 +56,16 @@ class ClosedLoop:
     low: Tensor
     high: Tensor
     accepted: float = -math.inf
+    direction: Direction | None = None
+    behind: Graph | None = None  # B of latents, where they hold a direction
+
+    def latent(self, point: Tensor) -> Tensor:
+        """Latents ``(*batch, p)`` of points of the domain."""
+        return point if self.direction is None else self.direction.lift(point)
 
     @property
     def latent_dim(self) -> int:
-        """Size of the latent."""
+        """Size of the latent, or of its chart."""
         return self.barrier.input_dim
 
     @property
@@ -95,7 +104,9 @@ class ClosedLoop:
         else:
             rows, constant = torch.ones(len(weight), 1, dtype=torch.float64), tuple(c + lost for c in constant)
         b, c = (torch.tensor(v, dtype=torch.float64) for v in (weight, constant))
-        of: dict[str, Any] = {"level": level, "lipschitz": known, "inner": self.inner, "error": error}
+        of: dict[str, Any] = {"level": level, "lipschitz": known, "inner": self.inner, "error": error, "behind": self.behind}
+        if self.direction is not None:
+            of["within"] = partial(within, direction=self.direction)
         return Problem(self.low, self.high, self.looped, rows, self.barrier, b, c, **of)
 
     def lost_by(self, error: float) -> float:
@@ -161,9 +172,15 @@ def closed_loop(
     chooses = FORMS.get(type(policy)) == "choosing"
     if chooses:
         _check_choice(policy, dynamics, barrier, corners)
-    alone, step, looped = Graph(latent_dim), Graph(latent_dim), Graph(latent_dim)
-    alone.network(0, barrier)
-    found, inner = (_append_steps(graph, dynamics, policy) for graph in (step, looped))
+    direction = direction_of(dynamics) if FORMS.get(type(dynamics)) == "residual" else None
+    behind = Graph(latent_dim)
+    behind.network(0, barrier)
+    if direction is not None:
+        corners = _chart_of(direction, corners)
+    of_chart = latent_dim if direction is None else latent_dim - 1
+    alone, step, looped = Graph(of_chart), Graph(of_chart), Graph(of_chart)
+    alone.network(_append_latent(alone, 0, direction), barrier)
+    found, inner = (_append_steps(graph, dynamics, policy, direction) for graph in (step, looped))
     sizes = {step.sizes[k] for k in found}
     if alone.output_dim != 1 or sizes != {latent_dim}:
         raise ConfigError(
@@ -172,7 +189,30 @@ def closed_loop(
     step.side_by_side(found)
     looped.side_by_side([looped.network(k, barrier) for k in inner])
     accepted = -float(cast(Tensor, policy.margin)) if chooses else -math.inf
-    return ClosedLoop(alone, step, looped, tuple(inner), float(lipschitz_bound), corners[0], corners[1], accepted)
+    turns: dict[str, Any] = {} if direction is None else {"direction": direction, "behind": behind}
+    return ClosedLoop(alone, step, looped, tuple(inner), float(lipschitz_bound), corners[0], corners[1], accepted, **turns)
+
+
+def _chart_of(direction: Direction, corners: Sequence[Tensor]) -> list[Tensor]:
+    """Corners of the charts of the whole domain; a part of it is a ConfigError."""
+    if bool((corners[0] != -1.0).any() | (corners[1] != 1.0).any()):
+        raise ConfigError("expected the whole domain [-1, 1]^p of latents that hold a direction, received a part of it")
+    around = math.pi * direction.radius * (1.0 + 1e-12)
+    return [torch.cat([c[: direction.first], c.new_tensor([s * around]), c[direction.first + 2 :]]) for s, c in zip((-1.0, 1.0), corners, strict=True)]
+
+
+def _append_latent(graph: Graph, chart: int, direction: Direction | None, clamped: int | None = None) -> int:
+    """Appends the latent of a chart, the entries beside the direction from another step where one is given; itself where there is none."""
+    if direction is None:
+        return chart
+    n, k, r = graph.sizes[chart], direction.first, direction.radius
+    eye, at = torch.eye(n, dtype=torch.float64), torch.tensor([0.5 * math.pi, 0.0], dtype=torch.float64)
+    waves = graph.apply(graph.linear([chart], [eye[k].expand(2, n) / r], at), sine())  # cosine and sine
+    others = torch.zeros(n + 1, n, dtype=torch.float64)
+    others[:k, :k], others[k + 2 :, k + 1 :] = eye[:k, :k], eye[k + 1 :, k + 1 :]
+    pair = torch.zeros(n + 1, 2, dtype=torch.float64)
+    pair[k : k + 2] = r * torch.eye(2, dtype=torch.float64)
+    return graph.linear([chart if clamped is None else clamped, waves], [others, pair])
 
 
 def _check_choice(policy: nn.Module, dynamics: nn.Module, barrier: nn.Module, corners: Sequence[Tensor]) -> None:
@@ -195,10 +235,11 @@ def _check_choice(policy: nn.Module, dynamics: nn.Module, barrier: nn.Module, co
         )
 
 
-def _append_steps(graph: Graph, dynamics: nn.Module, policy: nn.Module) -> list[int]:
+def _append_steps(graph: Graph, dynamics: nn.Module, policy: nn.Module, direction: Direction | None) -> list[int]:
     """Appends d(z, pi(z)), or what a policy that chooses compares: d(z, .) of its own action, then of those of its table."""
     chooses = FORMS.get(type(policy)) == "choosing"
-    own, scale = _append_policy(graph, cast(nn.Module, policy.policy) if chooses else policy)
+    latent = _append_latent(graph, 0, direction)
+    own, scale = _append_policy(graph, latent, cast(nn.Module, policy.policy) if chooses else policy)
     actions = [own]
     for action in cast(Tensor, policy.actions).detach().double().cpu() if chooses else ():
         if len(action) != graph.sizes[own]:
@@ -206,22 +247,24 @@ def _append_steps(graph: Graph, dynamics: nn.Module, policy: nn.Module) -> list[
         # A step of its own: in the bias of the next one, terms that cancel would seem to round off nothing.
         still = torch.zeros(len(action), graph.input_dim)
         actions.append(graph.linear([0], [still], action if scale is None else action / scale))
-    return [_append_dynamics(graph, dynamics, action, scale) for action in actions]
+    return [_append_dynamics(graph, latent, dynamics, action, scale, direction) for action in actions]
 
 
-def _append_policy(graph: Graph, policy: nn.Module) -> tuple[int, Tensor | None]:
+def _append_policy(graph: Graph, latent: int, policy: nn.Module) -> tuple[int, Tensor | None]:
     """Appends the policy; the result times the scale (where there is one) is the action in physical units."""
     net, scale = _taken_apart(policy, "policy", "bounded")
     if scale is None:
-        return graph.interface(graph.layers(0, net)), None
-    action = graph.interface(graph.apply(graph.layers(0, net), clamp()))
+        return graph.interface(graph.layers(latent, net)), None
+    action = graph.interface(graph.apply(graph.layers(latent, net), clamp()))
     return action, _checked_scale(scale, graph.sizes[action])
 
 
-def _append_dynamics(graph: Graph, dynamics: nn.Module, action: int, scale: Tensor | None) -> int:
+def _append_dynamics(
+    graph: Graph, latent: int, dynamics: nn.Module, action: int, scale: Tensor | None, direction: Direction | None
+) -> int:
     """Appends the dynamics, whose action is a step times the policy's scale."""
     layers, own = _taken_apart(dynamics, "dynamics", "residual")
-    p, m = graph.input_dim, graph.sizes[action]
+    p, m = graph.sizes[latent], graph.sizes[action]
     own = None if own is None else _checked_scale(own, m)
     if scale is not None and own is not None and not torch.equal(scale, own):
         raise StructureError(f"expected one action scale in dynamics and policy, received {scale.tolist()} and {own.tolist()}")
@@ -233,12 +276,13 @@ def _append_dynamics(graph: Graph, dynamics: nn.Module, action: int, scale: Tens
     first, last = layers[0], layers[-1]
     weights = [first.weight[:, :p], first.weight[:, p:]]
     # Of one scale in both modules nothing is left but the rounding of a product and a quotient.
-    hidden = graph.linear([0, action], weights, first.bias, roundings=0 if own is None else 3)
+    hidden = graph.linear([latent, action], weights, first.bias, roundings=0 if own is None else 3)
     if own is None:
         return graph.interface(graph.layers(hidden, layers[1:]))
     if len(layers) == 1 or not isinstance(last, nn.Linear):
         raise StructureError("expected the dynamics' network to start and end with different linear layers")
     hidden = graph.layers(hidden, layers[1:-1])
+    p = graph.input_dim  # a network that turns a direction moves the chart
     eye, rest = torch.eye(p), p - last.out_features
     if getattr(dynamics, "remembers", False) and rest == m:  # the action of this step, divided by its scale
         pads = [nn.functional.pad(t, (0, 0, 0, rest)) for t in (eye[:-rest], last.weight)]
@@ -246,7 +290,10 @@ def _append_dynamics(graph: Graph, dynamics: nn.Module, action: int, scale: Tens
         moved = graph.linear([0, hidden, action], [*pads, eye[:, -rest:]], bias, roundings=3)
     else:
         moved = graph.linear([0, hidden], [eye, last.weight], last.bias, roundings=1)
-    return graph.interface(graph.apply(moved, clamp()))
+    if direction is None:
+        return graph.interface(graph.apply(moved, clamp()))
+    moved = graph.interface(moved)
+    return graph.interface(_append_latent(graph, moved, direction, graph.apply(moved, clamp())))
 
 
 def _taken_apart(module: nn.Module, name: str, form: str) -> tuple[list[nn.Module], Tensor | None]:
@@ -538,7 +585,7 @@ def decide_domain(system: ClosedLoop, *, budget: Budget | None = None) -> Outcom
         'refuted'
     """
     last = system.step.steps[-1]
-    if system.chooses or (isinstance(last, Apply) and _within(last.activation, system)):  # of those that choose it was demanded
+    if system.chooses or system.direction is not None or (isinstance(last, Apply) and _within(last.activation, system)):  # of those that choose it was demanded
         return Outcome("proved", 0.0, -math.inf, None, 0, 0.0, 0.0, 0)
     p = system.latent_dim
     eye, low, high = torch.eye(p, dtype=torch.float64), system.low, system.high
@@ -705,7 +752,7 @@ def find_counterexamples(
     with torch.no_grad():
         points = points[problem.feasible(system.barrier(points)[:, 0])]
         if not len(points):
-            return torch.zeros(0, system.latent_dim)
+            return system.latent(torch.zeros(0, system.latent_dim))
         value = problem.evaluate(points)[0]
         worst = points[value.topk(min(n, len(points))).indices]
         steps = 0.02 * span * torch.randn(4, *worst.shape, generator=generator, dtype=torch.float64)
@@ -714,4 +761,4 @@ def find_counterexamples(
         value, barrier = problem.evaluate(points)
         bad = points[problem.feasible(barrier) & (value > 0)]
         order = problem.evaluate(bad)[0].argsort(descending=True) if len(bad) else torch.zeros(0, dtype=torch.int64)
-    return bad[order][:n].float()
+    return system.latent(bad[order][:n]).float()

@@ -58,7 +58,7 @@ def check_deployed(
     dtype = deployed_dtype(barrier, dynamics, policy)
     device = next(itertools.chain(barrier.parameters())).device
     point = _points(system, n, seed).to(dtype).double().clamp(system.low, system.high)
-    given: Tensor = point.to(device, dtype)
+    given: Tensor = system.latent(point).to(device, dtype)
 
     def step(z: Tensor) -> Tensor:
         after = [dynamics(torch.cat([z, u], -1)) if type(dynamics) is nn.Sequential else dynamics(z, u) for u in _actions(system, policy, z)]

@@ -167,11 +167,12 @@ class Experiment:
             options["image_size"] = self.env.image_size  # type: ignore[assignment]
         given = self._given_encoder
         encoder = build_encoder(net.encoder, **options) if given is None else call_with(given, options)
-        dynamics = LatentDynamics(net.latent_dim, len(scale), net.dynamics_hidden, scale, net.remember_action)
-        seen = getattr(encoder, "seen_dim", net.latent_dim)
-        if seen != dynamics.moving_dim:
+        turns = getattr(encoder, "turn_radius", 0.0)
+        dynamics = LatentDynamics(net.latent_dim, len(scale), net.dynamics_hidden, scale, net.remember_action, turns)
+        seen, shown = getattr(encoder, "seen_dim", net.latent_dim), net.latent_dim - len(scale) * net.remember_action
+        if seen != shown:
             raise ConfigError(
-                f"expected an encoder that fills {dynamics.moving_dim} of latent_dim={net.latent_dim} entries with "
+                f"expected an encoder that fills {shown} of latent_dim={net.latent_dim} entries with "
                 f"network.remember_action={net.remember_action}, received {type(encoder).__name__}, which fills {seen}"
             )
         policy = Policy(net.latent_dim, len(scale), net.policy_hidden, scale)

@@ -173,6 +173,34 @@ class Abs(nn.Module):
         return value.abs()
 
 
+@dataclass(frozen=True)
+class _Sine(Activation):
+    """The sine, which rises and falls again and again."""
+
+    def interval(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+        first, last = self.value(lower), self.value(upper)
+        low, high = torch.minimum(first, last), torch.maximum(first, last)
+        quarter, turn = 0.5 * math.pi, 2.0 * math.pi
+        for sign in (1.0, -1.0):  # is there a k with a peak (or a trough) at sign pi / 2 + 2 pi k between the two, or nearly?
+            after = ((lower - 1e-6 - sign * quarter) / turn).ceil() * turn + sign * quarter
+            there = after <= upper + 1e-6
+            high = torch.where(there, 1.0, high) if sign > 0 else high
+            low = torch.where(there, -1.0, low) if sign < 0 else low
+        return low, high
+
+
+def sine() -> Activation:
+    """The sine of a direction's angle; no network has it as a layer.
+
+    What a float32 evaluation may be off counts what the two numbers of a direction, kept in float32, are off their circle.
+
+    Example:
+        >>> [end.item() for end in sine().interval(torch.tensor([0.0]), torch.tensor([2.0]))]
+        [0.0, 1.0]
+    """
+    return _Sine("Sine", torch.sin, (-1.0, 1.0), curvature=1.0, ulps=16.0, jump=1e-6)
+
+
 def clamp(low: float = -1.0, high: float = 1.0) -> Activation:
     """The clamp to an interval, ``low < high``.
 

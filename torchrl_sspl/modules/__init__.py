@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from torchrl_sspl.modules.choosing import ChoosingPolicy
-from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder
+from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder, TurnedBearingEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
 from torchrl_sspl.modules.observer import LatentObserver, Predict
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
@@ -20,6 +20,7 @@ __all__ = [
     "Predict",
     "SaLaD",
     "ShapeEncoder",
+    "TurnedBearingEncoder",
     "as_tensordict_module",
     "inward_clamp",
     "make_rollout_policy",

@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sspl.direction import direction_of, within
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.modules.observer import completed, corrected, held
 
@@ -47,14 +48,16 @@ class Memory:
             self.prior, self.begins = seen, torch.ones(len(seen), dtype=torch.bool, device=seen.device)
         expected, agent = torch.where(self.begins[:, None], seen, self.prior), self.agent
         seen = completed(seen, expected, agent.gain)
-        latent, innovation = corrected(expected, seen, agent.gain)
-        latent, cut = held(agent.barrier, expected, latent, agent.held_error)
+        turns = direction_of(agent.dynamics)
+        latent, innovation = corrected(expected, seen, agent.gain, turns)
+        latent, cut = held(agent.barrier, expected, latent, agent.held_error, turns)
         return latent, innovation, cut, seen
 
     def unseen(self, n: int) -> Tensor:
         """Latents ``(n, p)`` where nothing is seen: what was expected; zeros where nothing was. Nothing is remembered."""
         if self.prior is None:
-            self.prior = torch.zeros(n, self.agent.latent_dim, device=self.agent.gain.device)
+            nothing = torch.zeros(n, self.agent.latent_dim, device=self.agent.gain.device)
+            self.prior = within(nothing, direction_of(self.agent.dynamics))
             self.begins = torch.ones(n, dtype=torch.bool, device=self.agent.gain.device)
         return self.prior
 

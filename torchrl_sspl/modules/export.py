@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.certificate import weights_digest
+from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import CertificationError, ConfigError, MissingDependencyError
 from torchrl_sspl.files import write
 from torchrl_sspl.modules.choosing import ChoosingPolicy
@@ -59,8 +60,9 @@ class DeployedStep(nn.Module):
         seen = agent.encoder(pixels)
         prior = torch.where(begins[:, None], seen, agent.dynamics(latent, action))
         seen = completed(seen, prior, agent.gain)
-        now, innovation = corrected(prior, seen, agent.gain)
-        now, _ = held(agent.barrier, prior, now, self.proved.held_error)
+        turns = direction_of(agent.dynamics)
+        now, innovation = corrected(prior, seen, agent.gain, turns)
+        now, _ = held(agent.barrier, prior, now, self.proved.held_error, turns)
         barrier, of_seen = agent.barrier(now)[:, 0], agent.barrier(seen)[:, 0]
         met = meets_premise(self.proved, barrier, of_seen, (now - prior).norm(dim=-1))
         return agent.policy(now), barrier, of_seen, innovation.norm(dim=-1), met, now

@@ -265,14 +265,15 @@ class ShapeEncoder(MomentEncoder):
 class Bearing(nn.Module):
     r"""Where the thing that stands still lies, seen from the one that moves, in its own directions.
 
-    .. math:: w_k = \max(0, |\kappa_k f_k - b_k| - \epsilon), \qquad c = \tfrac{1}{K} \sum_k c_k, \qquad e = \sum_k \alpha_k c_k, \qquad
+    .. math:: w_\pm = \max \Big( 0, \pm \sum_k \alpha_k |\kappa_k f_k - b_k| - \epsilon \Big), \qquad
+        c = \tfrac{1}{2} (c_+ + c_-), \qquad e = c_+ - c_-, \qquad
         h = \frac{1}{\|e\|} \begin{pmatrix} e_1 & e_2 \\ -e_2 & e_1 \end{pmatrix} (q - c)
 
-    with the centre :math:`c_k` of the weight :math:`w_k` of colour k on plain ground. What a camera's noise changes is no thing
+    with the centres :math:`c_\pm` of the weights :math:`w_\pm` on plain ground. What a camera's noise changes is no thing
     (:math:`\epsilon`), nor are another brightness (:math:`\kappa_k` makes the plain ground as bright as it was) and edges of the
     background that a camera shifted by a pixel moves (only plain ground counts). Where the ends of what moves differ in colour,
-    e points from one to the other: :math:`\alpha`, of sum zero, is the contrast of colours whose centres differ most. The place q
-    is the middle of what is not plain ground, the middle of the frame where all of it is. Background b and all statistics come
+    e points from one to the other: :math:`\alpha`, of sum zero, is the contrast of colours whose centres differ most. What is as dark in
+    all colours, such as legs, counts nothing. The place q is the middle of what is not plain ground, the middle of the frame where all of it is. Background b and all statistics come
     from frames alone and are set by :meth:`fit`. Distances are in half widths of the frame. Source: none.
 
     Args:
@@ -288,7 +289,7 @@ class Bearing(nn.Module):
         >>> bearing = Bearing(16)
         >>> bearing.fit(frames)
         >>> bearing(frames).shape
-        torch.Size([50, 2])
+        torch.Size([50, 4])
     """
 
     background: Tensor
@@ -307,20 +308,21 @@ class Bearing(nn.Module):
         self.register_buffer("anchor", torch.zeros(2))
         self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
 
-    def _centres(self, frames: Tensor) -> Tensor:
-        """Centres ``(n, 2, c)`` of the colours of frames ``(n, c, H, W)`` in [-1, 1], x to the right and y down."""
+    def _centres(self, frames: Tensor, mixed: Tensor) -> Tensor:
+        """Centres ``(n, 2, m)`` of mixtures ``(m, c)`` of the colours of frames ``(n, c, H, W)`` in [-1, 1], x to the right and y down."""
         light = ((frames + 1.0) * self.ground).sum((-2, -1))
         factor = (self.light / light.clamp_min(1e-3)).clamp(0.5, 2.0)[..., None, None]
         off = ((frames + 1.0) * factor - 1.0 - self.background).abs()
-        weight = (off - _FAINT).clamp_min(0.0) * self.ground
+        weight = ((mixed @ off.flatten(2)).unflatten(2, off.shape[2:]) - _FAINT).clamp_min(0.0) * self.ground
         # Less than one pixel in a thousand counts as nothing seen: the middle of the frame.
         mass = weight.sum((-2, -1)).clamp_min(1e-3 * self.axis.numel())
         return torch.stack([(weight.sum(-2) @ self.axis) / mass, (weight.sum(-1) @ self.axis) / mass], 1)
 
-    def centres(self, frames: Tensor) -> Tensor:
-        """As :meth:`_centres`, a few frames at a time, which stay in the cache; an exported graph has no loop."""
+    def centres(self, frames: Tensor, mixed: Tensor | None = None) -> Tensor:
+        """As :meth:`_centres`, by default of the two ends, a few frames at a time, which stay in the cache; an exported graph has no loop."""
+        mixed = torch.stack([self.contrast, -self.contrast]) if mixed is None else mixed
         parts = [frames] if torch.compiler.is_exporting() else frames.split(32)
-        return torch.cat([self._centres(part) for part in parts])
+        return torch.cat([self._centres(part, mixed) for part in parts])
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
@@ -332,18 +334,20 @@ class Bearing(nn.Module):
         self.anchor.copy_(torch.stack([(thing.sum(0) @ self.axis) / mass, (thing.sum(1) @ self.axis) / mass]))
         self.ground.copy_(1.0 - F.max_pool2d((thing > 0.0).float()[None], 3, 1, 1)[0])
         self.light.copy_(((self.background + 1.0) * self.ground).sum((-2, -1)))
-        centres = self.centres(frames).double()
+        centres = self.centres(frames, torch.eye(len(self.contrast), device=frames.device)).double()
         apart = centres - centres.mean(-1, keepdim=True)
         _, vectors = torch.linalg.eigh(torch.einsum("nik,nil->kl", apart, apart))
-        self.contrast.copy_(vectors[:, -1] - vectors[:, -1].mean())
+        contrast = vectors[:, -1] - vectors[:, -1].mean()
+        self.contrast.copy_(contrast / contrast.abs().amax().clamp_min(1e-9))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Place of the still thing ``(n, 2)``, ahead and aside of the moving one, of frames ``(n, c, H, W)``."""
+        """Place of the still thing, ahead and aside of the moving one, and e of length one: ``(n, 4)`` of frames ``(n, c, H, W)``."""
         centres = self.centres(frames)
-        ahead = centres @ self.contrast
+        ahead = centres[..., 0] - centres[..., 1]
         ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         away = self.anchor - centres.mean(-1)
-        return torch.stack([(ahead * away).sum(-1), ahead[:, 0] * away[:, 1] - ahead[:, 1] * away[:, 0]], -1)
+        place = torch.stack([(ahead * away).sum(-1), ahead[:, 0] * away[:, 1] - ahead[:, 1] * away[:, 0]], -1)
+        return torch.cat([place, ahead], -1)
 
 
 class BearingEncoder(MomentEncoder):
@@ -377,7 +381,7 @@ class BearingEncoder(MomentEncoder):
         if latent_dim < self.seen_dim or not reach > 0.0:
             raise ConfigError(f"expected latent_dim >= 2 and reach > 0, received {latent_dim} and {reach}")
         super().__init__(self.seen_dim, image_size, pool_to=pool_to)
-        self.latent_dim, self.reach = latent_dim, float(reach)
+        self.latent_dim, self.reach, self.features = latent_dim, float(reach), 4
         self.trunk, self.latent_head = nn.Sequential(Bearing(pool_to, self.in_channels)), nn.Sequential()
         self.gain.data.fill_(1.0 / self.reach)
         self.gain.requires_grad_(False)
@@ -388,4 +392,46 @@ class BearingEncoder(MomentEncoder):
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
         """Latent from the bearings of two successive frames, of which the second counts; see :meth:`FrameEncoder.head`."""
-        return F.pad(torch.tanh(self.gain * current), (0, self.latent_dim - self.seen_dim))
+        return F.pad(torch.tanh(self.gain * current[..., :2]), (0, self.latent_dim - self.seen_dim))
+
+
+class TurnedBearingEncoder(BearingEncoder):
+    r"""Bearing encoder that also sees how the thing that stands still is turned.
+
+    .. math:: z_t = (\tanh(h_t / r), \; \rho \cos k \alpha_t, \; \rho \sin k \alpha_t, \; 0) \in [-1, 1]^p
+
+    with the direction :math:`(\cos \alpha, \sin \alpha) = e` of :class:`Bearing` in the frame. What looks the same k times in a whole
+    turn needs a k-th of it: four for a square, one where nothing is known. The two entries are a
+    :class:`~torchrl_sspl.direction.Direction`, for dynamics of this ``turn_radius``. Source: paper eq. (7); the paper does not give
+    an architecture.
+
+    Args:
+        latent_dim: size p of the latent, at least four.
+        image_size, pool_to, reach: as for :class:`BearingEncoder`.
+        turn_radius: :math:`\rho`, latent units; how much a turn counts beside a distance.
+        folds: k.
+
+    Example:
+        >>> TurnedBearingEncoder(latent_dim=5, image_size=128)(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
+        torch.Size([2, 5])
+    """
+
+    seen_dim = 4
+
+    def __init__(
+        self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, reach: float = 0.625, turn_radius: float = 0.3,
+        folds: int = 4,
+    ) -> None:  # fmt: skip
+        if latent_dim < self.seen_dim or not 0.0 < turn_radius <= 1.0 or not isinstance(folds, int) or folds < 1:
+            raise ConfigError(
+                f"expected latent_dim >= 4, turn_radius in (0, 1] and folds >= 1, received {latent_dim}, {turn_radius!r} and {folds!r}"
+            )
+        super().__init__(latent_dim, image_size, pool_to=pool_to, reach=reach)
+        self.turn_radius, self.folds = float(turn_radius), folds
+        self.arguments |= {"turn_radius": self.turn_radius, "folds": folds}
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the bearings of two successive frames, of which the second counts; see :meth:`FrameEncoder.head`."""
+        angle = self.folds * torch.atan2(current[..., 3:], current[..., 2:3])
+        seen = [torch.tanh(self.gain * current[..., :2]), self.turn_radius * angle.cos(), self.turn_radius * angle.sin()]
+        return F.pad(torch.cat(seen, -1), (0, self.latent_dim - self.seen_dim))

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_sspl.direction import Direction
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
 from torchrl_sspl.lipschitz.layers import known_form
 
@@ -289,7 +290,8 @@ class LatentDynamics(_OfLatents):
 
     .. math:: d((y, a), u) = \operatorname{clamp}((y + \operatorname{net}(y, a, u / u_{\max}), u / u_{\max}), -1, 1)
 
-    which a system that acts late needs, and which no picture shows: an observer keeps them.
+    which a system that acts late needs, and which no picture shows: an observer keeps them. With ``turn_radius`` the two entries
+    before these are a :class:`~torchrl_sspl.direction.Direction`, which the network turns: its last output is a length along the circle.
     Source: paper eq. (8), third term; the paper does not give an architecture.
 
     Args:
@@ -297,6 +299,7 @@ class LatentDynamics(_OfLatents):
         hidden: widths of the hidden layers (ReLU).
         action_scale: physical units per unit of normalised action, a number or one per dimension.
         remembers: whether the last ``action_dim`` entries of the latent are the action before.
+        turn_radius: r of the direction, latent units; 0: none.
 
     Raises:
         ConfigError: if a size or the scale is not valid.
@@ -316,26 +319,40 @@ class LatentDynamics(_OfLatents):
         hidden: Sequence[int] = (64, 64),
         action_scale: float | Sequence[float] | Tensor = 1.0,
         remembers: bool = False,
+        turn_radius: float = 0.0,
     ) -> None:
         self.remembers = remembers
         if remembers and not latent_dim > action_dim:
             raise ConfigError(f"expected latent_dim > action_dim={action_dim} to remember actions, received {latent_dim}")
+        seen = latent_dim - action_dim if remembers else latent_dim
+        if not 0.0 <= turn_radius <= 1.0 or (turn_radius and seen < 2):
+            raise ConfigError(f"expected turn_radius in [0, 1] and two entries for it, received {turn_radius!r} and {seen} entries")
+        #: Where the latent holds a direction; None: nowhere.
+        self.direction = Direction(seen - 2, float(turn_radius)) if turn_radius else None
         super().__init__(latent_dim, action_dim, hidden, action_scale)
         if remembers:
             self.arguments["remembers"] = True
+        if turn_radius:
+            self.arguments["turn_radius"] = float(turn_radius)
 
     @property
     def moving_dim(self) -> int:
-        """Entries of the latent that the network predicts."""
-        return self.latent_dim - self.action_dim if self.remembers else self.latent_dim
+        """Numbers that the network predicts: one for each entry that pictures show, one for the two of a direction."""
+        seen = self.latent_dim - self.action_dim if self.remembers else self.latent_dim
+        return seen if self.direction is None else seen - 1
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
         """Next latent in ``[-1, 1]`` of latents ``(*batch, p)``, actions ``(*batch, action_dim)`` in physical units."""
         _check_last(latent, self.latent_dim, "latent")
         _check_last(action, self.action_dim, "action")
         action = action / self.action_scale
-        moved = latent[..., : self.moving_dim] + self.net(torch.cat([latent, action], -1))
-        return inward_clamp(torch.cat([moved, action], -1) if self.remembers else moved)
+        by = self.net(torch.cat([latent, action], -1))
+        if self.direction is None:
+            moved = latent[..., : self.moving_dim] + by
+            return inward_clamp(torch.cat([moved, action], -1) if self.remembers else moved)
+        first = self.direction.first
+        moved = [inward_clamp(latent[..., :first] + by[..., :first]), self.direction.turn(latent, by[..., first:])]
+        return torch.cat([*moved, inward_clamp(action)] if self.remembers else moved, -1)
 
 
 @known_form("bounded")

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from torchrl.data import Unbounded
 from torchrl.envs import TensorDictPrimer
 
+from torchrl_sspl.direction import Direction, direction_of, within
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.modules.salad import as_tensordict_module
 
@@ -59,12 +60,13 @@ def completed(seen: Tensor, prior: Tensor, gain: Tensor) -> Tensor:
     return torch.where((gain != 0).any(0), seen, prior)
 
 
-def corrected(prior: Tensor, seen: Tensor, gain: Tensor) -> tuple[Tensor, Tensor]:
+def corrected(prior: Tensor, seen: Tensor, gain: Tensor, direction: Direction | None = None) -> tuple[Tensor, Tensor]:
     r"""Posterior and innovation of an observer.
 
     .. math:: i_t = E(o_t) - p_t, \qquad \hat z_t = \operatorname{clamp}(p_t + K i_t, -1, 1)
 
-    Latents ``(*batch, p)``, gain ``(p, p)``. Source: none (the paper acts on :math:`E(o_t)`, which is K = I).
+    Latents ``(*batch, p)``, gain ``(p, p)``; a direction goes back onto its circle. Source: none (the paper acts on :math:`E(o_t)`,
+    which is K = I).
 
     Example:
         >>> corrected(torch.zeros(1, 1), torch.ones(1, 1), torch.tensor([[0.25]]))[0].tolist()
@@ -73,10 +75,12 @@ def corrected(prior: Tensor, seen: Tensor, gain: Tensor) -> tuple[Tensor, Tensor
     innovation = seen - prior
     left = torch.eye(len(gain), dtype=gain.dtype, device=gain.device) - gain
     # From what is seen, not from the prior: with K = I the result is what is seen, to the last bit.
-    return (seen - innovation @ left.mT).clamp(-1.0, 1.0), innovation
+    return within(seen - innovation @ left.mT, direction), innovation
 
 
-def held(barrier: Callable[[Tensor], Tensor], prior: Tensor, latent: Tensor, error: float) -> tuple[Tensor, Tensor]:
+def held(
+    barrier: Callable[[Tensor], Tensor], prior: Tensor, latent: Tensor, error: float, direction: Direction | None = None
+) -> tuple[Tensor, Tensor]:
     r"""The corrected latent, its correction cut to a length where the whole of it would leave the set of the prior.
 
     .. math:: \hat z = p + \delta \frac{\hat z' - p}{\lVert \hat z' - p \rVert} \quad \text{where } B(p) \le 0 < B(\hat z')
@@ -88,6 +92,7 @@ def held(barrier: Callable[[Tensor], Tensor], prior: Tensor, latent: Tensor, err
         barrier: latent -> barrier value ``(*batch, 1)``, at most zero means inside.
         prior, latent: before and after the correction, ``(*batch, p)``.
         error: :math:`\delta`, latent units; 0: nothing is cut.
+        direction: what is cut goes back onto its circle, and is cut so much more that it is not farther away then.
 
     Returns latents ``(*batch, p)`` and where something was cut ``(*batch,)``.
 
@@ -101,7 +106,8 @@ def held(barrier: Callable[[Tensor], Tensor], prior: Tensor, latent: Tensor, err
     moved = latent - prior
     length = moved.norm(dim=-1, keepdim=True)
     leaves = (barrier(prior) <= 0.0) & (barrier(latent) > 0.0) & (length > error)
-    return torch.where(leaves, (prior + moved * (error / length)).clamp(-1.0, 1.0), latent), leaves[..., 0]
+    most = error if direction is None else direction.shortened(error)
+    return torch.where(leaves, within(prior + moved * (most / length), direction), latent), leaves[..., 0]
 
 
 class LatentObserver(TensorDictModuleBase):
@@ -122,6 +128,7 @@ class LatentObserver(TensorDictModuleBase):
         gain: K, a number or ``(p, p)``; see :func:`gain_matrix`, for errors too.
         latent_dim: p.
         barrier, error: the set in which corrections are held, see :func:`held`; none by default.
+        direction: which entries of the latent are one; none by default.
 
     Source: none (Luenberger's observer on a learned latent; in world models prior and posterior); the paper has K = I.
 
@@ -145,8 +152,10 @@ class LatentObserver(TensorDictModuleBase):
         latent_dim: int,
         barrier: nn.Module | None = None,
         error: float = 0.0,
+        direction: Direction | None = None,
     ) -> None:
         super().__init__()
+        self.direction = direction
         if error > 0.0 and barrier is None:
             raise ConfigError(f"expected a barrier with error={error}, received none; give the one whose set tolerates it")
         self.barrier, self.error = barrier, error
@@ -163,9 +172,9 @@ class LatentObserver(TensorDictModuleBase):
         if prior.shape != seen.shape:
             raise ShapeError(f"expected a prior of shape {tuple(seen.shape)}, received {tuple(prior.shape)}; add the primer")
         expected = torch.where(begins, seen, prior)
-        latent, innovation = corrected(expected, completed(seen, expected, self.gain), self.gain)
+        latent, innovation = corrected(expected, completed(seen, expected, self.gain), self.gain, self.direction)
         if self.barrier is not None:
-            latent = held(self.barrier, expected, latent, self.error)[0]
+            latent = held(self.barrier, expected, latent, self.error, self.direction)[0]
         return tensordict.set(self.out_keys[0], latent).set("innovation", innovation)
 
     def make_tensordict_primer(self) -> TensorDictPrimer:
@@ -221,7 +230,7 @@ def filtered(
     rows = (~continues).nonzero()[:, 0]
     while len(rows):
         prior = dynamics(latent[rows], action[rows])
-        after[rows] = corrected(prior, completed(next_seen[rows], prior, gain), gain)[0]
+        after[rows] = corrected(prior, completed(next_seen[rows], prior, gain), gain, direction_of(dynamics))[0]
         rows = rows[rows + 1 < len(seen)] + 1
         rows = rows[continues[rows]]
         latent[rows] = after[rows - 1]

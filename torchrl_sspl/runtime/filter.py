@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchrl_sspl.certification.conditions import closed_loop
 from torchrl_sspl.certification.floating import UNITS, largest_rounding
+from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.observer import LatentObserver
@@ -165,7 +166,7 @@ class SafetyFilter(TensorDictModuleBase):
     def __init__(self, agent: Agent, **options: Any) -> None:
         super().__init__()
         self.agent, self.shield = agent, Shield(agent, **options)
-        self.observer = LatentObserver(agent.encoder, agent.gain, agent.latent_dim, agent.barrier, agent.held_error)
+        self.observer = LatentObserver(agent.encoder, agent.gain, agent.latent_dim, agent.barrier, agent.held_error, direction_of(agent.dynamics))
         self.in_keys = [*self.observer.in_keys, "action"]
         self.out_keys: list[Any] = [
             *self.observer.out_keys, "action", "intervened", "deviation", "safety_margin", ("next", "prior"),

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchrl.trainers import Trainer, TrainerHookBase
 
 from torchrl_sspl.configs.schema import SynthesisConfig
+from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.files import append
 from torchrl_sspl.modules.agent import Agent
@@ -201,6 +202,7 @@ class Workspace:
         self.logged_step = 0
         self.where: dict[str, Any] = {"phase": "", "round": 0}
         self.seen_dim: int | None = getattr(self.encoder, "seen_dim", None)
+        self.direction = direction_of(self.originals["dynamics"])  # which entries of the latent are one
         self.gain = gain_matrix(self.config.gain, self.latent_dim, self.seen_dim)
         self.latents: dict[str, Tensor] = {}
         self.counterexamples = torch.zeros(0, self.latent_dim)

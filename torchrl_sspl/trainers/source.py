@@ -15,6 +15,7 @@ from torchrl.envs import EnvBase
 from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.data.store import continues
+from torchrl_sspl.direction import direction_of
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.modules import LatentObserver, Predict
 from torchrl_sspl.modules.salad import make_rollout_policy
@@ -152,7 +153,7 @@ class Source:
         steps = self.steps if gain is None or self.steps is None else _LONGER * self.steps
         acting, predict = make_rollout_policy(self.encoder, policy.to(device)), None
         if gain is not None and dynamics is not None:
-            observer, decide = LatentObserver(self.encoder, gain, len(gain)).to(device), acting.module[-1]
+            observer, decide = LatentObserver(self.encoder, gain, len(gain), direction=direction_of(dynamics)).to(device), acting.module[-1]
             acting = TensorDictSequential(observer, decide, selected_out_keys=["latent", "action"])
             predict = Predict(copy.deepcopy(dynamics).to(device))
         space = self.env.action_spec_unbatched.space

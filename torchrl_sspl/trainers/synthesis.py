@@ -23,6 +23,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.configs.schema import SynthesisConfig
+from torchrl_sspl.direction import within
 from torchrl_sspl.functional import safe_hinge
 from torchrl_sspl.modules.observer import corrected, gain_matrix
 from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
@@ -53,7 +54,10 @@ _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data t
 _GRID_ROOM = 4.0  # ... that the one on a grid tolerates
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
 _WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
-_MEMORY = 17  # nodes of the grid per entry that no picture shows
+_MEMORY = 9  # nodes of the grid per entry that no picture shows
+_TURNS = 24  # ... around a direction
+_SEPARATE = 3000  # steps in which U is told from the rest
+_UNSAFE_FIRST = 5.0  # how much more a picture of U counts there
 _SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
 _NEAR_ZERO = 0.06  # of these targets, those that a batch has as many of as of all
 _DEPTH = 0.25  # barrier value up to which the targets on a grid go
@@ -192,7 +196,7 @@ class FitDynamics(_Training):
             here = rows[:, k]
             z.append(latent)
             if k + 1 < rows.shape[1]:
-                latent = corrected(work.dynamics(latent, data["action"][here]), data["next_seen"][here], work.gain)[0]
+                latent = corrected(work.dynamics(latent, data["action"][here]), data["next_seen"][here], work.gain, work.direction)[0]
         index = rows.mT.flatten()
         kept = index >= 0
         return torch.cat(z)[kept], index[kept]
@@ -384,7 +388,7 @@ class Tighten(FineTune):
         points = [near, uniform(work, samples, g)]
         if len(old):
             points += [old, old[work.loop.pick(len(old), samples // 2)] + 0.01 * torch.randn(samples // 2, p, generator=g)]
-        z = torch.cat(points).clamp(-1, 1)
+        z = within(torch.cat(points), work.direction)
         z = z[work.barrier(z)[:, 0] <= 0.02]
         if not len(z):
             return z
@@ -399,7 +403,7 @@ class Tighten(FineTune):
 class Settle(Tighten):
     """The smallest change after which no counterexample is found; for targets on a grid, which are nearly kept as they are fitted.
 
-    Of the pictures of U those count that the barrier puts lowest, whatever action the memory holds.
+    Of the pictures of U those count that the barrier puts lowest, of S those that it puts highest, whatever action the memory holds.
     Source: none (counterexample-guided synthesis).
     """
 
@@ -415,13 +419,13 @@ class Settle(Tighten):
         unsafe, safe = ((table["region"][:, 0] == code).nonzero()[:, 0] for code in (UNSAFE, SAFE))
         target = self._target(work, safe_coeff=0.0)  # S may reach to the border of what can be kept: no margin is asked there
 
-        def lowest(rows: Tensor) -> TensorDict:
+        def worst(rows: Tensor, count: int, high: bool) -> TensorDict:
             drawn = rows[pick(len(rows), 4 * s.batch)]
             latent = table["latent"][drawn]
             if work.seen_dim is not None:
                 latent = remembered(work, latent, work.loop.generator)
             with torch.no_grad():
-                found = work.barrier(latent)[:, 0].topk(s.batch // 2, largest=False).indices
+                found = work.barrier(latent)[:, 0].topk(count, largest=high).indices
             return table[drawn[found]].set("latent", latent[found])
 
         def step() -> dict[str, Tensor]:
@@ -433,10 +437,10 @@ class Settle(Tighten):
             latent = torch.cat(asked)
             terms = dict(self._loss(TensorDict(latent=latent, batch_size=[len(latent)])).items())
             terms["loss_counterexample"] = _LEAST_WEIGHT * terms["loss_counterexample"]
-            drawn = [table[pick(len(table), s.batch)], lowest(unsafe)]
+            drawn = [table[pick(len(table), s.batch)], worst(unsafe, s.batch // 2, False)]
             terms |= dict(target(torch.cat(drawn)).items())
             if len(safe):
-                missed = safe_hinge(work.barrier(table["latent"][safe[pick(len(safe), s.batch)]]), _SPARE)
+                missed = safe_hinge(work.barrier(worst(safe, s.batch // 4, True)["latent"]), _SPARE)
                 terms["loss_safe"] = _LEAST_WEIGHT * missed.mean()
             return terms
 
@@ -482,7 +486,7 @@ def off_manifold(work: Workspace, latent: Tensor, radius: float, salt: int) -> t
     direction = (normal @ torch.randn(*latent.shape, 1, generator=g))[..., 0]
     length = direction.norm(dim=-1, keepdim=True)
     moved = radius * torch.rand(len(latent), 1, generator=g)
-    points = (latent + moved * direction / length.clamp_min(1e-6)).clamp(-1, 1)
+    points = within(latent + moved * direction / length.clamp_min(1e-6), work.direction)
     # Where another sheet of the manifold is nearer than the one it came from, a point says nothing.
     kept = (length[:, 0] > 1e-3) & (nearest_distance(points, cloud) > 0.85 * moved[:, 0])
     rows = kept.nonzero()[:, 0]
@@ -491,7 +495,11 @@ def off_manifold(work: Workspace, latent: Tensor, radius: float, salt: int) -> t
 
 def uniform(work: Workspace, n: int, generator: torch.Generator) -> Tensor:
     """``(n, p)`` latents of the whole domain."""
-    z = torch.rand(n, work.latent_dim, generator=generator) * 2 - 1
+    turns = work.direction
+    z = torch.rand(n, work.latent_dim - (turns is not None), generator=generator) * 2 - 1
+    if turns is not None:
+        z[:, turns.first] *= math.pi * turns.radius
+        z = turns.lift(z)
     return z if work.seen_dim is None else remembered(work, z, generator)
 
 
@@ -613,20 +621,29 @@ def _clearance_targets(
 def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -> tuple[Tensor, ...]:
     """Signed distance to what some action of the table keeps, whatever error is added, on a grid over the latent domain; and the
     taught policy."""
-    s, p, taught = work.config, work.latent_dim, work.taught or work.policy
-    seen = work.seen_dim or p
+    s, taught, turns = work.config, work.taught or work.policy, work.direction
+    seen, hidden = work.seen_dim or work.latent_dim, work.latent_dim - (work.seen_dim or work.latent_dim)
     looks_unsafe, room = z[unsafe][:, :seen], max(s.guard, 1.0 / (s.grid - 1))  # at least half of a cell
-    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * seen).reshape(-1, seen)
+    low, sizes, period = [-1.0] * seen, [s.grid] * seen, [0.0] * seen
+    lift, chart = (lambda x: x,) * 2
+    if turns is not None:  # the grid is one of charts
+        low, sizes, period = low[:-1], [*sizes[:-2], _TURNS], [0.0] * (seen - 1)
+        low[-1], period[-1] = -math.pi * turns.radius, 2.0 * math.pi * turns.radius
+        lift, chart = turns.lift, turns.chart
+    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * len(low)).reshape(-1, len(low))
+    if len(low) > 2:  # the ends of the axes and the corners
+        signs = signs[(signs.abs().sum(1) != 2)]
     length = signs.norm(dim=1, keepdim=True).clamp_min(1.0)
-    errors = torch.nn.functional.pad(_GRID_ROOM * s.tolerated_error * signs / length, (0, p - seen))
+    errors = torch.nn.functional.pad(_GRID_ROOM * s.tolerated_error * signs / length, (0, hidden))
+    low, sizes, period = low + [-1.0] * hidden, sizes + [_MEMORY] * hidden, period + [0.0] * hidden
+    margin = _unsafe_margin(work, z[:, :seen], unsafe) if turns is not None else lambda x: nearest_distance(x[:, :seen], looks_unsafe)
     found = viability_kernel(
-        work.dynamics, low=[-1.0] * p, high=[1.0] * p, resolution=[s.grid] * seen + [_MEMORY] * (p - seen), errors=errors,
-        margin=lambda x: nearest_distance(x[:, :seen], looks_unsafe) - room, actions=action_grid(work.action_scale, s.choices or s.actions),
-        exit_is_safe=False,
+        lambda x, u: chart(work.dynamics(lift(x), u)), low=low, high=[-v for v in low], resolution=sizes, period=period, errors=errors,
+        margin=lambda x: margin(lift(x)) - room, actions=action_grid(work.action_scale, s.choices or s.actions), exit_is_safe=False,
     )  # fmt: skip
     if not bool((found.value > 0.0).any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
         found = replace(found, value=found.margin)
-    distance = _signed_distance(found, queries)
+    distance = _signed_distance(found, chart(queries))
     target = (_SLOPE * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
     work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
     work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
@@ -636,15 +653,53 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
 def _signed_distance(found: ViabilityKernel, queries: Tensor) -> Tensor:
     """Distance of queries ``(n, d)`` to a set on a grid, ``(n,)``, negative inside: exact at the nodes of a grid twice as fine, on which
     the values are interpolated, and interpolated between them."""
-    fine = Grid(found.grid.low, found.grid.high, [2 * n - 1 for n in found.grid.shape])
+    around = [bool(p) for p in found.grid.period]
+    fine = Grid(found.grid.low, found.grid.high, [2 * n - (not p) for n, p in zip(found.grid.shape, around, strict=True)], found.grid.period)
     inside = (found.interpolate(fine.nodes()) > 0.0).reshape(fine.shape).numpy()
     if inside.all() or not inside.any():
         return torch.full((len(queries),), -math.inf if inside.all() else math.inf)
     half = 0.5 * fine.step[0]  # the border lies between two nodes
+    wide = [(n // 4, n // 4) if p else (0, 0) for n, p in zip(fine.shape, around, strict=True)]  # what lies behind the seam
+    inside = np.pad(inside, wide, mode="wrap")
     outer, inner = (distance_transform_edt(part, sampling=fine.step) for part in (~inside, inside))
     distance = np.where(inside, half - inner, outer - half)
-    index, within, _ = fine.locate(queries)
-    return fine.gather(fine.pad(torch.from_numpy(distance).float()), index, within)
+    distance = distance[tuple(slice(a, d - b) for (a, b), d in zip(wide, distance.shape, strict=True))]
+    index, part, _ = fine.locate(queries)
+    return fine.gather(fine.pad(torch.from_numpy(distance.copy()).float()), index, part)
+
+
+@torch.enable_grad()
+def _unsafe_margin(work: Workspace, seen: Tensor, unsafe: Tensor) -> Callable[[Tensor], Tensor]:
+    """Distance to what looks unsafe, roughly, as a function of latents: a small network that tells pictures of U from others.
+
+    In three dimensions and more, samples lie too far apart for the distance to the nearest of them.
+    """
+    g = torch.Generator().manual_seed(work.seed + 66_000)
+    with torch.random.fork_rng():
+        torch.manual_seed(work.seed + 66_001)
+        net = nn.Sequential(nn.Linear(seen.shape[1], 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1))
+    near = nearest_distance(seen, seen[unsafe]) < _DEPTH
+    rows = [part.nonzero()[:, 0] for part in (unsafe, near & ~unsafe)]
+    optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _SEPARATE)
+    label, weight = torch.cat([-torch.ones(1024), torch.ones(1024)]), torch.cat([torch.full((1024,), _UNSAFE_FIRST), torch.ones(1024)])
+    for _ in range(_SEPARATE):
+        z = torch.cat([seen[r[torch.randint(len(r), (1024,), generator=g)]] for r in rows])
+        loss = (weight * nn.functional.softplus(-label * net(z)[:, 0])).mean()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        schedule.step()
+    net.requires_grad_(False)
+
+    def margin(latent: Tensor) -> Tensor:
+        with torch.enable_grad():
+            z = latent[:, : seen.shape[1]].detach().requires_grad_()
+            value = net(z)[:, 0]
+            (slope,) = torch.autograd.grad(value.sum(), z)
+        return (value / slope.norm(dim=1).clamp_min(1e-3)).detach().clamp(-1.0, 1.0)
+
+    return margin
 
 
 @torch.no_grad()

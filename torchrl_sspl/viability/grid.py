@@ -330,7 +330,8 @@ class _Problem:
             raise ShapeError(f"margin: expected shape {(nodes.shape[0],)}, received {tuple(self.margin.shape)}.")
         if errors is not None and (errors.ndim != 2 or errors.shape[1] != nodes.shape[1] or not len(errors)):
             raise ShapeError(f"errors: expected shape (j, {nodes.shape[1]}), received {tuple(errors.shape)}.")
-        ends = [torch.tensor(v) for v in (self.grid.low, self.grid.high)]
+        around = torch.tensor([bool(p) for p in self.grid.period])
+        ends = [torch.tensor(v).masked_fill(around, s * math.inf) for s, v in ((-1.0, self.grid.low), (1.0, self.grid.high))]
         self.successors = []  # per action, for every error: cell, position in it, outside
         for action in actions.to(nodes):
             after = dynamics(nodes, action.expand(nodes.shape[0], -1))
