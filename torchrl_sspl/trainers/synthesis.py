@@ -381,7 +381,7 @@ class Tighten(FineTune):
         return {k: _WEIGHT * v if k.startswith("loss") else v for k, v in terms.items()}
 
     @torch.no_grad()
-    def _search(self, work: Workspace, rim: Tensor, samples: int = 60_000) -> Tensor:
+    def _search(self, work: Workspace, rim: Tensor, samples: int = 150_000) -> Tensor:
         """The worst latents of the set, up to as many as are kept; those that are nearly counterexamples count, too."""
         g, p, old = work.loop.generator, work.latent_dim, work.counterexamples
         near = rim[work.loop.pick(len(rim), samples)] + 0.04 * torch.randn(samples, p, generator=g)
