@@ -54,10 +54,11 @@ _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data t
 _GRID_ROOM = 4.0  # ... that the one on a grid tolerates
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
 _WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
+_STAY = 1.0  # weight of the targets where the smallest change is sought
 _MEMORY = 9  # nodes of the grid per entry that no picture shows
 _TURNS = 24  # ... around a direction
 _SEPARATE = 3000  # steps in which U is told from the rest
-_UNSAFE_FIRST = 5.0  # how much more a picture of U counts there
+_UNSAFE_FIRST = 3.0  # how much more a picture of U counts there
 _SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
 _NEAR_ZERO = 0.06  # of these targets, those that a batch has as many of as of all
 _DEPTH = 0.25  # barrier value up to which the targets on a grid go
@@ -163,7 +164,9 @@ class FitDynamics(_Training):
 
     def run(self, work: Workspace) -> None:
         s, data = work.config, work.latents
-        tube, base = off_manifold(work, data["latent"], 1.3 * s.tube_radius, self.number)
+        # A grid covers a domain that the data fill: what seems to lie beside them is a gap between samples, and leads nowhere else.
+        rows = data["latent"][:0] if s.grid else data["latent"]
+        tube, base = off_manifold(work, rows, 1.3 * s.tube_radius, self.number)
         on, off = (2 * s.batch // 6, s.batch // 6) if not work.observing else (s.batch // 4, s.batch)
         loss = ConsistencyLoss(work.dynamics, unsafe_weight=s.unsafe_weight, worst_coeff=0.2, worst_fraction=0.05)
 
@@ -438,7 +441,7 @@ class Settle(Tighten):
             terms = dict(self._loss(TensorDict(latent=latent, batch_size=[len(latent)])).items())
             terms["loss_counterexample"] = _LEAST_WEIGHT * terms["loss_counterexample"]
             drawn = [table[pick(len(table), s.batch)], worst(unsafe, s.batch // 2, False)]
-            terms |= dict(target(torch.cat(drawn)).items())
+            terms |= {k: _STAY * v if k.startswith("loss") else v for k, v in target(torch.cat(drawn)).items()}
             if len(safe):
                 missed = safe_hinge(work.barrier(worst(safe, s.batch // 4, True)["latent"]), _SPARE)
                 terms["loss_safe"] = _LEAST_WEIGHT * missed.mean()
