@@ -20,6 +20,7 @@ import torch
 from scipy.ndimage import distance_transform_edt
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.nn import functional as F
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.configs.schema import SynthesisConfig
@@ -406,7 +407,7 @@ class Tighten(FineTune):
 class Settle(Tighten):
     """The smallest change after which no counterexample is found; for targets on a grid, which are nearly kept as they are fitted.
 
-    Of the pictures of U those count that the barrier puts lowest, of S those that it puts highest, whatever action the memory holds.
+    Of the pictures of U those count that the barrier puts lowest, whatever action the memory holds, of S those that it puts highest.
     Source: none (counterexample-guided synthesis).
     """
 
@@ -425,8 +426,9 @@ class Settle(Tighten):
         def worst(rows: Tensor, count: int, high: bool) -> TensorDict:
             drawn = rows[pick(len(rows), 4 * s.batch)]
             latent = table["latent"][drawn]
-            if work.seen_dim is not None:
-                latent = remembered(work, latent, work.loop.generator)
+            if work.seen_dim is not None:  # an episode that begins in S remembers nothing; U may be met with any memory
+                alone = F.pad(latent[:, : work.seen_dim], (0, work.latent_dim - work.seen_dim))
+                latent = alone if high else remembered(work, latent, work.loop.generator)
             with torch.no_grad():
                 found = work.barrier(latent)[:, 0].topk(count, largest=high).indices
             return table[drawn[found]].set("latent", latent[found])
@@ -637,7 +639,7 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     if len(low) > 2:  # the ends of the axes and the corners
         signs = signs[(signs.abs().sum(1) != 2)]
     length = signs.norm(dim=1, keepdim=True).clamp_min(1.0)
-    errors = torch.nn.functional.pad(_GRID_ROOM * s.tolerated_error * signs / length, (0, hidden))
+    errors = F.pad(_GRID_ROOM * s.tolerated_error * signs / length, (0, hidden))
     low, sizes, period = low + [-1.0] * hidden, sizes + [_MEMORY] * hidden, period + [0.0] * hidden
     margin = _unsafe_margin(work, z[:, :seen], unsafe) if turns is not None else lambda x: nearest_distance(x[:, :seen], looks_unsafe)
     found = viability_kernel(
@@ -688,7 +690,7 @@ def _unsafe_margin(work: Workspace, seen: Tensor, unsafe: Tensor) -> Callable[[T
     label, weight = torch.cat([-torch.ones(1024), torch.ones(1024)]), torch.cat([torch.full((1024,), _UNSAFE_FIRST), torch.ones(1024)])
     for _ in range(_SEPARATE):
         z = torch.cat([seen[r[torch.randint(len(r), (1024,), generator=g)]] for r in rows])
-        loss = (weight * nn.functional.softplus(-label * net(z)[:, 0])).mean()
+        loss = (weight * F.softplus(-label * net(z)[:, 0])).mean()
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
