@@ -44,6 +44,7 @@ from torchrl_sspl.trainers import (
     SSPLTrainer,
     SteerPolicy,
     TeachPolicy,
+    Tighten,
     Workspace,
 )
 from torchrl_sspl.trainers.progress import Progress
@@ -114,17 +115,19 @@ class Catching(InnerLoop):
         super().__call__(steps, networks, loss)
 
 
-def workspace(latents: int, rows: int = 4000) -> Workspace:
+def workspace(latents: int, rows: int = 4000, **settings: Any) -> Workspace:
     """Networks of the pendulum's size and latents on a curved surface, with a system that is easy to keep."""
     torch.manual_seed(0)
     nets = LatentDynamics(3, 1, (96, 96), 10.0), SandwichBarrier(3, (96, 96, 96), 2.0), Policy(3, 1, (48, 48), 10.0)
-    config = SynthesisConfig(batch=latents, actions=11, teacher="clearance", residual_spread=0.0, counterexamples=0)
+    config = SynthesisConfig(batch=latents, actions=11, teacher="clearance", residual_spread=0.0, counterexamples=0, **settings)
     work = Workspace(nn.Identity(), *nets, config=config)
     place, action = torch.rand(rows, 2) * 1.6 - 0.8, torch.rand(rows, 1) * 20 - 10
 
     def lift(x: Tensor) -> Tensor:
         return torch.cat([x, 0.3 * x.square().sum(-1, keepdim=True)], -1)
 
+    with torch.no_grad():  # half of the data inside
+        work.barrier.bias[-1].sub_(work.barrier(lift(place)).median())
     after = (0.95 * place + 0.02 * torch.cat([action, -action], -1)).clamp(-0.9, 0.9)
     far = place.norm(dim=-1, keepdim=True)
     region = torch.where(far > 0.7, UNSAFE, torch.where(far < 0.2, SAFE, 0))
@@ -183,28 +186,42 @@ def bare_fit(work: Workspace, asked: dict[str, Any]) -> Update:
     return update
 
 
+def still(network: nn.Module, *inputs: Tensor) -> Tensor:
+    """What a network gives, its weights held still."""
+    for p in network.parameters():
+        p.requires_grad_(False)
+    found = network(*inputs)
+    for p in network.parameters():
+        p.requires_grad_(True)
+    return found
+
+
+def steepest(barrier: nn.Module, z: Tensor, size: float) -> Tensor:
+    """The errors of a size that raise the barrier most."""
+    at = z.detach().requires_grad_()
+    (slope,) = torch.autograd.grad(still(barrier, at).sum(), at)
+    return size * slope / slope.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+
+
 def bare_tune(work: Workspace, asked: dict[str, Any], *, steer: bool = False) -> Update:
     s, pick, barrier, policy, dynamics = work.config, work.loop.pick, work.barrier, work.policy, work.dynamics
     names = ("latent", "barrier_target", "inside", "action_target", "action_weight", "region")
     columns, rim, shares = [asked["table"][k] for k in names], asked["rim"], asked["shares"]
     origins, residuals, n = rim["latent"], rim["residual"], len(columns[0])
-    margin, model = (2 if steer else 1) * s.margin, list(dynamics.parameters())
-
-    def predict(z: Tensor, action: Tensor) -> Tensor:
-        for p in model:
-            p.requires_grad_(False)
-        found = dynamics(z, action)
-        for p in model:
-            p.requires_grad_(True)
-        return found
+    margin = (2 if steer else 1) * s.margin
 
     def update() -> Tensor:
         drawn = torch.cat([pick(n, s.batch), *(rows[pick(len(rows), k)] for rows, k in shares if len(rows))])
         asked_rows = pick(len(rim), 3 * s.batch // 2)
-        error = residuals[asked_rows][torch.arange(len(asked_rows)), pick(s.residuals, len(asked_rows))]
         z = origins[asked_rows]
+        if s.tolerated_error:
+            with torch.no_grad():
+                after = dynamics(z, policy(z))
+            error = steepest(barrier, after, s.tolerated_error)
+        else:
+            error = residuals[asked_rows][torch.arange(len(asked_rows)), pick(s.residuals, len(asked_rows))]
         origin = torch.stack([z, torch.rand_like(z) * 2.0 - 1.0])
-        successor = (predict(origin, policy(origin)) + torch.stack([error, torch.zeros_like(error)])).clamp(-1.0, 1.0)
+        successor = (still(dynamics, origin, policy(origin)) + torch.stack([error, torch.zeros_like(error)])).clamp(-1.0, 1.0)
         now, then = barrier(torch.stack([origin, successor])).unbind(0)
         violation = (then + margin).clamp_min(0.0) * (s.band - now).clamp_min(0.0) / s.band
         total = worst(violation[0], 1.0, 0.02) + worst(violation[1], 1.0, 0.02)
@@ -223,6 +240,26 @@ def bare_steer(work: Workspace, asked: dict[str, Any]) -> Update:
     return bare_tune(work, asked, steer=True)
 
 
+def bare_tighten(work: Workspace, asked: dict[str, Any]) -> Update:
+    s, barrier, policy, dynamics, loop = work.config, work.barrier, work.policy, work.dynamics, work.loop
+    tune, rim, phase, found = bare_tune(work, asked), asked["rim"]["latent"], asked["self"], torch.zeros(0)
+
+    def update() -> Tensor:
+        nonlocal found
+        total = tune()
+        if loop.step % 100 == 0:  # the search is no mathematics of a loss: both sides make the same
+            found = work.counterexamples = phase._search(work, rim)
+            assert len(found), "nothing to train on"
+        z = found[loop.pick(len(found), s.batch)]
+        after = still(dynamics, z, policy(z))
+        after = after + steepest(barrier, after, s.tolerated_error)
+        violation, short = (still(barrier, after) + 0.004).clamp_min(0.0), (0.01 - barrier(z)).clamp_min(0.0)
+        given_up = violation.detach().clamp_max(0.05) / 0.05 * short
+        return total + 2.0 * (worst(given_up, 0.3, 0.02) + (0.3 * violation * (short.detach() > 0.0)).mean())
+
+    return update
+
+
 JOINT = {"world-model": False, "whole-loss": True}
 FROZEN: dict[str, tuple[Any, Any]] = {
     "dynamics": (FitDynamics, bare_dynamics),
@@ -230,7 +267,9 @@ FROZEN: dict[str, tuple[Any, Any]] = {
     "fit": (FitSets, bare_fit),
     "steer": (SteerPolicy, bare_steer),
     "tune": (FineTune, bare_tune),
+    "tighten": (Tighten, bare_tighten),
 }
+SETTINGS: dict[str, dict[str, Any]] = {"tighten": {"tolerated_error": 0.006}}
 
 
 def frozen(name: str, latents: int) -> tuple[Side, Side]:
@@ -238,7 +277,7 @@ def frozen(name: str, latents: int) -> tuple[Side, Side]:
     sides = []
     kind, bare = FROZEN[name]
     for hand in (False, True):
-        work = workspace(latents)
+        work = workspace(latents, **SETTINGS.get(name, {}))
         phase, loop = kind(0), Catching(0)
         work.loop = loop
         with contextlib.suppress(_Caught):
@@ -277,7 +316,7 @@ def by_hand(update: Update, loop: InnerLoop, rates: dict[nn.Module, float], step
     adam = torch.optim.Adam([{"params": list(net.parameters()), "lr": lr} for net, lr in rates.items()])
     cycle = torch.optim.lr_scheduler.OneCycleLR(adam, list(rates.values()), total_steps=max(steps, 2), pct_start=0.1)
     torch.manual_seed(int(torch.randint(2**31, (1,), generator=loop.generator)))
-    for _ in range(steps):
+    for loop.step in range(steps):
         value = update()
         adam.zero_grad()
         value.backward()

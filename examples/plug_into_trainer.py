@@ -11,6 +11,7 @@ from torchrl_sspl import Agent, evaluate
 from torchrl_sspl.configs import compose
 from torchrl_sspl.data import RandomActions, TransitionStore
 from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.evaluation.certify import premise
 from torchrl_sspl.lipschitz import SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, SaLaD, make_rollout_policy
 from torchrl_sspl.objectives import SSPLLoss
@@ -40,7 +41,9 @@ def main(*overrides: str, batches: int = 19, updates: int = 400, loop: bool = Fa
     frames = {"frames_per_batch": 1280, "total_frames": 1280 * batches, "init_random_frames": 1280 * first}
     acting = RandomActions(env, seed) if phases else make_rollout_policy(salad, policy)
     collector = Collector(env, acting, auto_register_policy_transforms=False, max_frames_per_traj=4, **frames)
-    work = Workspace(*salad, policy, config=config.synthesis, source=Source(make_env, salad.encoder, store=store), seed=seed)
+    taken = {"starts": config.collector.starts, "steps": config.synthesis.episode_steps, "seed": seed}
+    source = Source(make_env, salad.encoder, store=store, **taken)
+    work = Workspace(*salad, policy, config=config.synthesis, source=source, seed=seed)
     rounds = Phases(synthesis_phases(config.synthesis, check=CheckRound) if phases else [], work, progress=True)
 
     def begin():  # before the updates of a batch: after half of them, SSPLLoss alone turns to barrier and policy
@@ -66,7 +69,8 @@ def main(*overrides: str, batches: int = 19, updates: int = 400, loop: bool = Fa
         trainer.register_op("pre_optim_steps", begin)
         rounds.register(trainer)  # they run when all transitions are collected
         trainer.train()
-    agent = Agent.from_loss(loss, level=work.level)
+    agent = Agent.from_loss(loss, level=work.level, **(work.acts() if phases else {}))  # behind the observer of the phases
+    agent.description["tolerated_error"] = premise(agent) if phases else 0.0  # its memory's corrections are held by it
     measured = evaluate(agent, env, config.evaluation, progress=True)
     return {name: measured[name] for name in SHOWN}
 

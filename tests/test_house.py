@@ -1,4 +1,4 @@
-"""The size of functions and classes, and what may not be in a file that is shipped."""
+"""The size of functions and classes, what there is one of, and what may not be in a file that is shipped."""
 
 from __future__ import annotations
 
@@ -68,6 +68,64 @@ def test_functions_and_classes_are_small():
 )
 def test_what_is_too_large_is_seen(source, found):
     assert sorted(too_large(source)) == found
+
+
+#: What there is one of: calls by which it is known, the files that hold it, and others with such calls that are none.
+ONE = {
+    "optimiser loop": (
+        r"\.backward",
+        {"trainers/stepper.py": "on pictures", "trainers/phases.py": "on frozen tensors, for everything else"},
+    ),
+    "closed-loop simulator": (
+        r"(^|\.)(env|world)\.(step|dynamics)$|\.step_and_maybe_reset$",
+        {
+            "evaluation/simulation.py": "the simulator",
+            "evaluation/blocks.py": "one step with the action zero tells two systems apart",
+            "evaluation/known.py": "one step, whose error in the latent is measured",
+            "envs/gymnasium.py": "an environment around another",
+            "runtime/wrapper.py": "an environment around another",
+            "experiments/film.py": "a world around another",
+        },
+    ),
+    "parser of settings": (
+        r"\.from_dotlist$|\.partition\('='\)$",
+        {"configs/reader.py": "the parser", "cli.py": "options of the command, --jobs=2"},
+    ),
+}
+
+
+def callers(source: str, pattern: str) -> bool:
+    """Whether a file calls something whose name matches, docstrings not counted; `.partition` with its argument."""
+    names = [
+        ast.unparse(n) if ast.unparse(n.func).endswith(".partition") else ast.unparse(n.func)
+        for n in ast.walk(ast.parse(source))
+        if isinstance(n, ast.Call)
+    ]
+    return any(re.search(pattern, name) for name in names)
+
+
+@pytest.mark.parametrize("thing", ONE)
+def test_there_is_one_of_it(thing):
+    pattern, known = ONE[thing]
+    found = {str(path.relative_to(PACKAGE)) for path in PACKAGE.rglob("*.py") if callers(path.read_text(), pattern)}
+    assert found == set(known), f"{thing}: {sorted(found ^ set(known))}"
+
+
+@pytest.mark.parametrize(
+    ("thing", "line", "seen"),
+    [
+        ("optimiser loop", "loss.backward()", True),
+        ("optimiser loop", "(a + b).sum().backward()", True),
+        ("optimiser loop", "def backward(x): return x", False),
+        ("closed-loop simulator", "data = env.step(data)", True),
+        ("closed-loop simulator", "self.world.step(u)", True),
+        ("closed-loop simulator", "z = agent.dynamics(z, u)", False),
+        ("parser of settings", "key, _, value = word.partition('=')", True),
+        ("parser of settings", "name.partition('.')", False),
+    ],
+)
+def test_another_one_is_seen(thing, line, seen):
+    assert callers(line, ONE[thing][0]) is seen
 
 
 @pytest.mark.parametrize("path", SHIPPED, ids=lambda p: str(p.relative_to(PACKAGE)))

@@ -301,6 +301,28 @@ def test_a_walk_through_the_middle_enters_and_goes_on():
     assert (found.region[-1] == UNSAFE).all()
 
 
+@pytest.mark.parametrize(
+    ("acts", "env", "where"),
+    [
+        (lambda pixels: torch.zeros(len(pixels), 1), PendulumEnv(image_size=16), {"start": torch.tensor([[0.1, 0.0], [2.5, 0.0]])}),
+        (lane_agent(3.0), lane((1,)), {"episodes": 2}),
+        (straight_ahead(), World(), {"start": torch.tensor([[-1.5, 0.0, 0.0]])}),
+    ],
+)
+def test_who_watches_is_told_of_every_observation_and_may_end_it(acts, env, where):
+    told = []
+    found = simulate(acts, env, horizon=4, watch=lambda decision, region: told.append((decision, region.tolist())), **where)
+    episodes = [found] if len(told[0][1]) == len(found) else [found.select([k]) for k in range(len(found))]
+    assert [region for _, region in told] == [row for e in episodes for row, alive in zip(e.region.tolist(), e.alive, strict=True) if alive.any()]
+    assert all(isinstance(decision, Decision) for decision, _ in told)
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        simulate(acts, env, horizon=4, watch=stop, **where)
+
+
 @pytest.mark.parametrize(("fault", "event"), [("contact", "hit"), ("fallen", "fallen")])
 def test_contacts_and_falls_are_kept(fault, event):
     found = simulate(straight_ahead(), World(**{fault: 2}), start=torch.tensor([[-1.5, 1.8, 0.0]]), horizon=6)

@@ -21,7 +21,7 @@ from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.experiments.description import describe, differences
-from torchrl_sspl.experiments.guidance import advice
+from torchrl_sspl.experiments.own_systems import advice
 from torchrl_sspl.experiments.run import Experiment, run_experiment
 from torchrl_sspl.sets import UNLABELLED
 from torchrl_sspl.trainers.hooks import RestartHook

@@ -264,6 +264,10 @@ def test_an_agent_of_a_loss_has_the_networks_of_the_loss():
         assert torch.equal(value, agent.state_dict()[name]), name
     assert {p.data_ptr() for p in loss.parameters()}.isdisjoint(p.data_ptr() for p in agent.parameters())
     loss(_batch())  # the loss still works
+    table = torch.tensor([[-1.0], [1.0]])
+    observing = Agent.from_loss(loss, gain=0.3, choices=table, choice_margin=0.01)
+    assert torch.equal(observing.policy.actions, table)
+    assert torch.equal(observing.gain, 0.3 * torch.eye(observing.latent_dim))
 
 
 def _batch():

@@ -159,7 +159,7 @@ def test_the_level_moves_what_is_accepted():
 def test_measurements_in_host_memory_choose_by_the_copies(monkeypatch):
     agent = tiny()
     monkeypatch.setattr(agents, "next", lambda _: type("Elsewhere", (), {"device": torch.device("cuda")}), raising=False)
-    copied = agents.hosted(agent)
+    copied = agents.on_host(agent)
     assert copied.policy.loop == (copied.dynamics, copied.barrier)
     assert copied.barrier is not agent.barrier
 

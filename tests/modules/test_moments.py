@@ -158,7 +158,7 @@ def test_a_bearing_is_the_obstacle_in_the_robots_frame_to_a_few_centimetres(bear
     off = seen - (truth if forward else -truth)
     assert float(off.mean(0)[0].abs()) < 0.15  # seen from the middle between the coloured ends, 0.1 m ahead of the base
     assert (off - off.mean(0)).norm(dim=-1).square().mean().sqrt() < 0.05  # m; a pixel has 0.038 m
-    assert (off / truth.norm(dim=-1)).max() < 0.1
+    assert ((off - off.mean(0)).norm(dim=-1) / truth.norm(dim=-1)).max() < 0.1
 
 
 def test_a_bearing_does_not_change_when_robot_and_obstacle_turn_together(bearings):

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
-PHASES = ["world-model", "whole-loss", "dynamics", "teach", "fit", "steer", "tune"]
+PHASES = ["world-model", "whole-loss", "dynamics", "teach", "fit", "steer", "tune", "tighten"]
 
 
 @pytest.fixture

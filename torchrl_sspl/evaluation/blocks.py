@@ -21,7 +21,7 @@ from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, RandomCo
 from torchrl_sspl.evaluation.measurements import MakeEnv
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.functional import covering_radius
-from torchrl_sspl.modules.agent import Agent, hosted
+from torchrl_sspl.modules.agent import Agent, on_host
 from torchrl_sspl.modules.controller import premise_met
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE
@@ -177,7 +177,7 @@ class StateBlocks:
     def __init__(
         self, agent: Agent, env: SafetyEnv, record: Record, level: float, tolerated: float | None = None
     ) -> None:
-        self.agent, self.env, self.record, self.level, self.tolerated = hosted(agent), env, record, level, tolerated
+        self.agent, self.env, self.record, self.level, self.tolerated = on_host(agent), env, record, level, tolerated
         self.held = holds_at(agent, level)
 
     @torch.no_grad()
@@ -329,7 +329,7 @@ def _trajectories(e: Episodes) -> list[str]:
 
 def summarise(record: Record, blocks: Sequence[Block], agent: Agent) -> None:
     """Fills in what needs all blocks: lengths, repetitions, errors, and the samples of the paper's conditions."""
-    agent = hosted(agent)
+    agent = on_host(agent)
     steps = torch.cat([b.steps for b in blocks])
     error, prints = torch.cat([b.error.double() for b in blocks]), [p for b in blocks for p in b.prints]
     trained_on = agent.description.get("trained_on")

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation.measurements import Draw
-from torchrl_sspl.modules.agent import Agent, hosted
+from torchrl_sspl.modules.agent import Agent, on_host
 from torchrl_sspl.modules.controller import Memory, meets_premise
 
 CHUNK = 1000  # frames drawn and encoded at a time
@@ -128,7 +128,7 @@ class AgentController:
 
     def __init__(self, agent: Agent, driver: Any = None, change: Callable[[Tensor, Tensor], Tensor] | None = None) -> None:
         self._device = next(agent.barrier.parameters()).device
-        self.agent, self.change = hosted(agent), change
+        self.agent, self.change = on_host(agent), change
         self.driver = None if driver is None else as_controller(driver)
         #: Whether ``step`` takes a camera, too.
         self.streams = self.driver is None or getattr(self.driver, "streams", False)

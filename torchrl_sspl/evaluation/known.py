@@ -18,7 +18,7 @@ from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, Camera, 
 from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, quantiles, share
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.lipschitz import lipschitz_lower
-from torchrl_sspl.modules.agent import Agent, hosted
+from torchrl_sspl.modules.agent import Agent, on_host
 from torchrl_sspl.sets import Region
 from torchrl_sspl.viability.grid import ViabilityKernel, recoverable_set, viability_kernel
 
@@ -33,7 +33,7 @@ def encode_states(agent: Agent, env: SafetyEnv, state: Tensor, *, draw: Draw | N
         state: ``(n, state_dim)``.
         draw: states ``(n, state_dim)`` -> frames ``(n, 3, H, W)`` uint8; default ``env.draw``.
     """
-    agent, draw = hosted(agent), draw or env.draw
+    agent, draw = on_host(agent), draw or env.draw
     if not len(state):
         return torch.zeros(0, agent.latent_dim)
     parts = state.split(CHUNK)

@@ -16,6 +16,7 @@ from torchrl_sspl.evaluation.controllers import _NONE, CHUNK, Camera, Controller
 from torchrl_sspl.evaluation.measurements import Draw
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
+Watch = Callable[[Decision, Tensor], None]
 #: Events of an episode in full physics, and the entry of ``info`` that tells each.
 EVENTS = {"entered": "unsafe", "hit": "contact", "fallen": "fallen", "left": "left"}
 
@@ -96,6 +97,7 @@ def simulate(
     draw: Draw | None = None,
     film: int = 0,
     label: str | None = None,
+    watch: Watch | None = None,
 ) -> Episodes:
     """Lets anything act on a system, episode by episode or side by side.
 
@@ -117,6 +119,8 @@ def simulate(
         draw: states -> frames uint8 ``(n, 3, H, W)`` in place of ``env.draw``.
         film: of how many episodes the frames are kept.
         label: title of a progress bar; none without.
+        watch: called as it happens, after every observation of some episodes, with what was decided and the labels of
+            the true states ``(k,)``; what it raises ends the simulation.
 
     Raises:
         ConfigError: if it is not clear what to run, or the controller reads what the environment does not show.
@@ -134,25 +138,26 @@ def simulate(
             f"episodes={episodes} and no start"
         )
     if start is not None and hasattr(env, "dynamics"):
-        return _from_states(acts, env, start, horizon, draw or env.draw, film, label)
+        return _from_states(acts, env, start, horizon, draw or env.draw, film, label, watch)
     if isinstance(env, EnvBase):
         if start is not None or draw is not None:
             raise ConfigError(f"simulate: expected no start and no draw: {type(env).__name__} runs from its own resets")
         if seed is not None:
             env.set_seed(seed)
-        return _from_resets(acts, env, int(episodes or 0), horizon, film, label)
+        return _from_resets(acts, env, int(episodes or 0), horizon, film, label, watch)
     poses: Sequence[Any] = [None] * int(episodes or 0) if start is None else torch.as_tensor(start).tolist()
     bar = tqdm(poses, desc=label, unit="episode", disable=label is None, leave=False)
     seeds = [None if seed is None else seed + k for k in range(len(poses))]
-    found = [_in_world(acts, env, p, horizon, seeds[k], k < film) for k, p in enumerate(bar)]
+    found = [_in_world(acts, env, p, horizon, seeds[k], k < film, watch) for k, p in enumerate(bar)]
     return found[0].joined(*found[1:])
 
 
 class _Record:
     """What the steps of some episodes leave behind."""
 
-    def __init__(self) -> None:
+    def __init__(self, watch: Watch | None) -> None:
         self.columns: dict[str, list[Tensor]] = {}
+        self.watch = watch
 
     def add(self, **values: Tensor | None) -> None:
         for name, value in values.items():
@@ -161,6 +166,8 @@ class _Record:
 
     def judge(self, decision: Decision, region: Tensor, alive: Tensor, gone: Tensor | None = None) -> None:
         """An observation, and what is thought of it; of whoever is gone nothing."""
+        if self.watch is not None:
+            self.watch(decision, region)
         values = {"barrier": decision.barrier, "seen": decision.seen}
         if gone is not None:
             values = {k: None if v is None else v.masked_fill(gone, -1.0) for k, v in values.items()}
@@ -192,12 +199,12 @@ def _asked(acts: Controller, last: bool) -> Callable[..., Decision]:
 
 
 def _from_states(
-    acts: Controller, env: Any, start: Tensor, horizon: int, draw: Draw, film: int, label: str | None
+    acts: Controller, env: Any, start: Tensor, horizon: int, draw: Draw, film: int, label: str | None, watch: Watch | None
 ) -> Episodes:
     streams = getattr(acts, "streams", False)
     if len(start) > CHUNK and not streams:  # pictures of a thousand episodes at a time
         parts = start.split(CHUNK)
-        found = [_from_states(acts, env, x, horizon, draw, film - k * CHUNK, label) for k, x in enumerate(parts)]
+        found = [_from_states(acts, env, x, horizon, draw, film - k * CHUNK, label, watch) for k, x in enumerate(parts)]
         return found[0].joined(*found[1:])
     if acts.reads not in ("pixels", "state"):
         raise ConfigError(
@@ -211,7 +218,7 @@ def _from_states(
         return camera if streams else torch.cat(list(camera.pixels()))
 
     acts.reset()
-    state, exit_is_safe, record = start, env.exit_region == SAFE, _Record()
+    state, exit_is_safe, record = start, env.exit_region == SAFE, _Record(watch)
     alive = torch.ones(len(start), dtype=torch.bool)
     left = ~env.state_space.contains(start)
     decision = acts.step(shown())
@@ -238,12 +245,14 @@ def _from_states(
     return record.episodes(horizon, {"left": left})
 
 
-def _from_resets(acts: Controller, env: EnvBase, n: int, horizon: int, film: int, label: str | None) -> Episodes:
+def _from_resets(
+    acts: Controller, env: EnvBase, n: int, horizon: int, film: int, label: str | None, watch: Watch | None
+) -> Episodes:
     k = env.batch_size[0]
     bar = tqdm(total=n, desc=label, unit="episode", leave=False, disable=label is None)
     parts: list[Episodes] = []
     while len(parts) * k < n:
-        parts.append(_one_batch(acts, env, k, horizon, film - len(parts) * k))
+        parts.append(_one_batch(acts, env, k, horizon, film - len(parts) * k, watch))
         bar.update(k)
     bar.close()
     found = parts[0].joined(*parts[1:])
@@ -252,8 +261,8 @@ def _from_resets(acts: Controller, env: EnvBase, n: int, horizon: int, film: int
     return cut
 
 
-def _one_batch(acts: Controller, env: EnvBase, k: int, horizon: int, film: int) -> Episodes:
-    record, alive = _Record(), torch.ones(k, dtype=torch.bool)
+def _one_batch(acts: Controller, env: EnvBase, k: int, horizon: int, film: int, watch: Watch | None) -> Episodes:
+    record, alive = _Record(watch), torch.ones(k, dtype=torch.bool)
 
     def shown(data: Any) -> Tensor:
         if acts.reads not in data:
@@ -290,10 +299,10 @@ def _one_batch(acts: Controller, env: EnvBase, k: int, horizon: int, film: int) 
 
 
 def _in_world(
-    acts: Controller, env: Any, pose: Iterable[float] | None, horizon: int, seed: int | None, film: bool
+    acts: Controller, env: Any, pose: Iterable[float] | None, horizon: int, seed: int | None, film: bool, watch: Watch | None
 ) -> Episodes:
     """One episode in a gymnasium environment, up to the first of: steps are over, it terminates, falls, or leaves."""
-    record, alive = _Record(), torch.ones(1, dtype=torch.bool)
+    record, alive = _Record(watch), torch.ones(1, dtype=torch.bool)
     events = dict.fromkeys(EVENTS, False)
 
     def shown(observation: Any, info: dict[str, Any]) -> Tensor:

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate
-from torchrl_sspl.configs.reader import EnvFactory, compose
+from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.configs.schema import Config
 from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions, make_collector
@@ -37,7 +37,7 @@ from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
 from torchrl_sspl.evaluation.outcome import Outcome, write_metrics
 from torchrl_sspl.evaluation.physics import evaluate_physics
 from torchrl_sspl.experiments.description import describe, differences
-from torchrl_sspl.experiments.guidance import advice, check_encoder, check_factory
+from torchrl_sspl.experiments.own_systems import advice, check_encoder, check_factory
 from torchrl_sspl.files import RunDirectory, write
 from torchrl_sspl.interrupts import interruptible
 from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
@@ -429,7 +429,7 @@ class Experiment:
 
     def _warnings(self, evaluation: Evaluation) -> list[str]:
         lines = list(self.work.warnings)
-        if not self.config.agent and self.trainer.optimization_stepper.blind:
+        if not self.config.agent and self.trainer.optimization_stepper.unseparated:
             lines.append(
                 "the joint training did not tell S from U: what they differ in may be too small in the pictures (image_size, "
                 "network.pool_to) or too rare in the data (trainer.total_frames, reset_options), or the latent is filled with "
@@ -492,7 +492,7 @@ def run_experiment(
     Returns the outcome: agent, evaluation, certificate, report. Raises ConfigError if a key or a value is not valid.
     Source: paper, Algorithm 1.
     """
-    given = sorted({k.partition("=")[0] for k in (*overrides, *defaults) if str(k).partition("=")[0].split(".")[0] == "env"})
+    given = sorted(k for k in {**parse(overrides), **defaults} if k.split(".")[0] == "env")
     if given:
         raise ConfigError(
             f"expected no setting of env where the environment is given in code, received {', '.join(given)}; set it there, "

@@ -166,10 +166,9 @@ class Agent(nn.Module):
         return cls(nets[0], nets[1], deployed, nets[3], bound, body, gain)
 
     @classmethod
-    def from_loss(cls, loss: Any, *, level: float = 0.0, description: dict[str, Any] | None = None) -> Agent:
-        """A frozen copy of the networks of an ``SSPLLoss``; arguments as for :meth:`from_networks`."""
-        nets = loss.encoder, loss.dynamics, loss.barrier, loss.actor_network
-        return cls.from_networks(*nets, level=level, description=description)
+    def from_loss(cls, loss: Any, **options: Any) -> Agent:
+        """A frozen copy of the networks of an ``SSPLLoss``; options as for :meth:`from_networks`."""
+        return cls.from_networks(loss.encoder, loss.dynamics, loss.barrier, loss.actor_network, **options)
 
     @torch.no_grad()
     def encode(self, pixels: Tensor) -> Tensor:
@@ -309,7 +308,7 @@ class _Elsewhere(nn.Module):
         return self.encoder(pixels.to(self.device)).cpu()
 
 
-def hosted(agent: Agent) -> Agent:
+def on_host(agent: Agent) -> Agent:
     """The agent for measurements, which draw states and count in host memory; itself if it is there already.
 
     The encoder, in which the time goes, stays on its device and takes and gives tensors of the host; the small networks

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
@@ -20,6 +22,18 @@ def _background(frames: Tensor) -> Tensor:
     if len(frames) < 10:
         raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
     return frames[:2000].median(0).values
+
+
+def _centre(weight: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean x and y (down) under weights ``(..., H, W)``, each ``(...)``."""
+    # Less than one pixel in a thousand counts as nothing seen: the middle of the frame.
+    mass = weight.sum((-2, -1)).clamp_min(1e-3 * axis.numel())
+    return (weight.sum(-2) @ axis) / mass, (weight.sum(-1) @ axis) / mass
+
+
+def _in_parts(function: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
+    """A function of frames, of a few at a time, which stay in the cache; an exported graph has no loop."""
+    return torch.cat([function(part) for part in ([frames] if torch.compiler.is_exporting() else frames.split(32))])
 
 
 class ColourMoments(nn.Module):
@@ -62,17 +76,13 @@ class ColourMoments(nn.Module):
 
     def centres(self, frames: Tensor) -> Tensor:
         """Centres ``(n, 2 c)`` in [-1, 1] of frames ``(n, c, H, W)``: first all x, then all y (down)."""
-        weight = (frames - self.background).abs()
-        # Less than one pixel in a thousand counts as nothing seen: the middle of the frame.
-        mass = weight.sum((-2, -1)).clamp_min(1e-3 * self.axis.numel())
-        x, y = (weight.sum(-2) @ self.axis) / mass, (weight.sum(-1) @ self.axis) / mass
-        return torch.cat([x, y], -1)
+        return torch.cat(_centre((frames - self.background).abs(), self.axis), -1)
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
         """Take background and whitening from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(_background(frames))
-        centre = torch.cat([self.centres(part) for part in frames.split(32)]).double()
+        centre = _in_parts(self.centres, frames).double()
         values, vectors = torch.linalg.eigh(torch.cov(centre.T))
         kept = self.whitening.shape[1]
         scale = values[-kept:].clamp_min(1e-8).rsqrt()
@@ -81,10 +91,7 @@ class ColourMoments(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Whitened centres ``(n, kept)`` of frames ``(n, c, H, W)``."""
-        # A few frames at a time stay in the cache; an exported graph has no loop.
-        parts = [frames] if torch.compiler.is_exporting() else frames.split(32)
-        centre = torch.cat([self.centres(part) for part in parts])
-        return (centre - self.mean) @ self.whitening
+        return (_in_parts(self.centres, frames) - self.mean) @ self.whitening
 
 
 class MomentEncoder(FrameEncoder):
@@ -202,15 +209,14 @@ class ShapeMoments(nn.Module):
     def fit(self, frames: Tensor) -> None:
         """Take background and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(_background(frames))
-        found = torch.cat([self.moments(part) for part in frames.split(32)])
+        found = _in_parts(self.moments, frames)
         # One scale for both directions: turning the frame turns what is seen.
         pairs = found[:, :4].unflatten(-1, (2, 2)).square().mean((0, 2)).sqrt()
         self.scale.copy_(torch.cat([pairs.repeat_interleave(2), found[:, 4:].median(0).values]).clamp_min(1e-8))
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scaled moments ``(n, 5)`` of frames ``(n, c, H, W)``."""
-        parts = [frames] if torch.compiler.is_exporting() else frames.split(32)
-        return torch.cat([self.moments(part) for part in parts]) / self.scale
+        return _in_parts(self.moments, frames) / self.scale
 
 
 class ShapeEncoder(MomentEncoder):
@@ -308,21 +314,15 @@ class Bearing(nn.Module):
         self.register_buffer("anchor", torch.zeros(2))
         self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
 
-    def _centres(self, frames: Tensor, mixed: Tensor) -> Tensor:
-        """Centres ``(n, 2, m)`` of mixtures ``(m, c)`` of the colours of frames ``(n, c, H, W)`` in [-1, 1], x to the right and y down."""
+    def centres(self, frames: Tensor, mixed: Tensor | None = None) -> Tensor:
+        """Centres ``(n, 2, m)`` of mixtures ``(m, c)`` of the colours of frames ``(n, c, H, W)``, by default of the two ends: in [-1, 1],
+        x to the right and y down."""
+        mixed = torch.stack([self.contrast, -self.contrast]) if mixed is None else mixed
         light = ((frames + 1.0) * self.ground).sum((-2, -1))
         factor = (self.light / light.clamp_min(1e-3)).clamp(0.5, 2.0)[..., None, None]
         off = ((frames + 1.0) * factor - 1.0 - self.background).abs()
-        weight = ((mixed @ off.flatten(2)).unflatten(2, off.shape[2:]) - _FAINT).clamp_min(0.0) * self.ground
-        # Less than one pixel in a thousand counts as nothing seen: the middle of the frame.
-        mass = weight.sum((-2, -1)).clamp_min(1e-3 * self.axis.numel())
-        return torch.stack([(weight.sum(-2) @ self.axis) / mass, (weight.sum(-1) @ self.axis) / mass], 1)
-
-    def centres(self, frames: Tensor, mixed: Tensor | None = None) -> Tensor:
-        """As :meth:`_centres`, by default of the two ends, a few frames at a time, which stay in the cache; an exported graph has no loop."""
-        mixed = torch.stack([self.contrast, -self.contrast]) if mixed is None else mixed
-        parts = [frames] if torch.compiler.is_exporting() else frames.split(32)
-        return torch.cat([self._centres(part, mixed) for part in parts])
+        seen = (mixed @ off.flatten(2)).unflatten(2, off.shape[2:])
+        return torch.stack(_centre((seen - _FAINT).clamp_min(0.0) * self.ground, self.axis), 1)
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
@@ -330,11 +330,11 @@ class Bearing(nn.Module):
         self.background.copy_(_background(frames))
         off = (self.background - self.background.flatten(1).median(1).values[:, None, None]).abs().amax(0)
         thing = torch.where(off > _NOISE, off, 0.0)
-        mass = thing.sum().clamp_min(1e-3 * self.axis.numel())
-        self.anchor.copy_(torch.stack([(thing.sum(0) @ self.axis) / mass, (thing.sum(1) @ self.axis) / mass]))
+        self.anchor.copy_(torch.stack(_centre(thing, self.axis)))
         self.ground.copy_(1.0 - F.max_pool2d((thing > 0.0).float()[None], 3, 1, 1)[0])
         self.light.copy_(((self.background + 1.0) * self.ground).sum((-2, -1)))
-        centres = self.centres(frames, torch.eye(len(self.contrast), device=frames.device)).double()
+        colours = torch.eye(len(self.contrast), device=frames.device)
+        centres = _in_parts(lambda part: self.centres(part, colours), frames).double()
         apart = centres - centres.mean(-1, keepdim=True)
         _, vectors = torch.linalg.eigh(torch.einsum("nik,nil->kl", apart, apart))
         contrast = vectors[:, -1] - vectors[:, -1].mean()
@@ -342,7 +342,7 @@ class Bearing(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Place of the still thing, ahead and aside of the moving one, and e of length one: ``(n, 4)`` of frames ``(n, c, H, W)``."""
-        centres = self.centres(frames)
+        centres = _in_parts(self.centres, frames)
         ahead = centres[..., 0] - centres[..., 1]
         ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         away = self.anchor - centres.mean(-1)

@@ -80,17 +80,17 @@ class PictureModel(nn.Module):
 
     def fit(self, latent: Tensor, picture: Tensor, *, steps: int = 3000, seed: int = 0, progress: bool = False) -> None:
         """Regress on latents ``(n, p)`` and small pictures ``(n, 3, 16, 16)``."""
-        adam = torch.optim.Adam(self.parameters(), 3e-3)
-        cycle = torch.optim.lr_scheduler.OneCycleLR(adam, 3e-3, total_steps=steps)
-        g = torch.Generator().manual_seed(seed)
-        with torch.enable_grad():
-            for _ in tqdm(range(steps), desc="pictures", disable=not progress, leave=False):
-                rows = torch.randint(len(latent), (256,), generator=g)
-                loss = (self(latent[rows]) - picture[rows]).square().mean()
-                adam.zero_grad()
-                loss.backward()
-                adam.step()
-                cycle.step()
+        from torchrl_sspl.trainers.phases import InnerLoop
+
+        loop = InnerLoop(seed)
+
+        def step() -> dict[str, Tensor]:
+            rows = loop.pick(len(latent), 256)
+            return {"loss": (self(latent[rows]) - picture[rows]).square().mean()}
+
+        with tqdm(total=steps, desc="pictures", disable=not progress, leave=False) as bar, torch.random.fork_rng(), torch.enable_grad():
+            loop.tick = bar.update
+            loop(steps, {self: 3e-3}, step)
         self.requires_grad_(False)
 
 

@@ -14,8 +14,10 @@ if TYPE_CHECKING:  # what readers of the source, type checkers among them, need 
         FitDynamics,
         FitSets,
         Gather,
+        Settle,
         SteerPolicy,
         TeachPolicy,
+        Tighten,
         synthesis_phases,
     )
     from torchrl_sspl.trainers.trainer import SSPLTrainer
@@ -25,13 +27,14 @@ _NAMES = {
     **dict.fromkeys(("CheckRound", "PlaceLevel"), "selection"),
     **dict.fromkeys(("Source", "starts_of"), "source"),
     **dict.fromkeys(
-        ("FineTune", "FitDynamics", "FitSets", "Gather", "SteerPolicy", "TeachPolicy", "synthesis_phases"), "synthesis"
+        ("FineTune", "FitDynamics", "FitSets", "Gather", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "synthesis_phases"),
+        "synthesis",
     ),
     "SSPLTrainer": "trainer",
 }
 __all__ = [
     "Check", "CheckRound", "FineTune", "FitDynamics", "FitSets", "Gather", "InnerLoop", "Phase", "Phases", "PlaceLevel",
-    "SSPLTrainer", "Source", "SteerPolicy", "TeachPolicy", "Workspace", "starts_of", "synthesis_phases",
+    "SSPLTrainer", "Settle", "Source", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "starts_of", "synthesis_phases",
 ]  # fmt: skip
 
 

@@ -263,7 +263,7 @@ class RestartHook(_Hook):
         """Looks, and begins again if need be."""
         stepper = self.trainer.optimization_stepper
         falling, self.last = stepper.mislabelled < 0.8 * self.last, stepper.mislabelled
-        if not stepper.blind or falling or stepper.count < self.after or self.restarts == self.most:
+        if not stepper.unseparated or falling or stepper.count < self.after or self.restarts == self.most:
             return
         self.restarts += 1
         loss = self.trainer.loss_module

@@ -90,7 +90,7 @@ class SSPLStepper(OptimizationStepper):
         return {key: value / self.inside for key, value in self.sums.items()}
 
     @property
-    def blind(self) -> bool:
+    def unseparated(self) -> bool:
         """Whether S and U are yet to be told apart."""
         return self.warm_start_error is not None and self.mislabelled > self.warm_start_error
 
@@ -103,11 +103,11 @@ class SSPLStepper(OptimizationStepper):
 
     def step(self, trainer: Trainer, sub_batch: TensorDictBase) -> TensorDictBase:
         """Detached scalars of one step on a batch of transitions; the trainer gives loss module and clipping."""
-        blind = self.blind
-        warm = blind or self.count < self.warm_start_steps or self.warm_start_steps < 0
+        unseparated = self.unseparated
+        warm = unseparated or self.count < self.warm_start_steps or self.warm_start_steps < 0
         self.count += 1
         device = self.optimizer.param_groups[0]["params"][0].device.type
-        eased = _without_worst(trainer.loss_module) if blind else nullcontext()
+        eased = _without_worst(trainer.loss_module) if unseparated else nullcontext()
         with eased, torch.autocast(device, dtype=self.autocast, enabled=self.autocast is not None):
             terms = trainer.compute_loss(sub_batch, method="world_model" if warm else None)
             total: Tensor = sum(v for k, v in terms.items() if k.startswith("loss_"))  # type: ignore[assignment]
@@ -117,7 +117,7 @@ class SSPLStepper(OptimizationStepper):
         before = self._barrier_state()
         self.optimizer.step()
         self._backtrack(before)
-        if blind:  # only now: a GPU is waited for here
+        if unseparated:  # only now: a GPU is waited for here
             self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
         extra = {"grad_norm": norm.detach(), "warm_start": torch.tensor(float(warm)), **self._lipschitz_step()}
         told = {**dict(terms.detach().items()), **extra}

@@ -26,12 +26,13 @@ from torchrl_sspl.certification.conditions import closed_loop, find_counterexamp
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.direction import within
 from torchrl_sspl.functional import safe_hinge
+from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.modules.observer import corrected, gain_matrix
 from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
-from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
+from torchrl_sspl.trainers.phases import InnerLoop, Phase, Workspace, action_grid
 from torchrl_sspl.viability import ViabilityKernel, viability_kernel
 from torchrl_sspl.viability.cloud import (
     barrier_targets,
@@ -58,7 +59,7 @@ _WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
 _STAY = 1.0  # weight of the targets where the smallest change is sought
 _MEMORY = 9  # nodes of the grid per entry that no picture shows
 _TURNS = 24  # ... around a direction
-_SEPARATE = 3000  # steps in which U is told from the rest
+_SEPARATE = 2000  # steps in which U is told from the rest
 _UNSAFE_FIRST = 3.0  # how much more a picture of U counts there
 _SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
 _NEAR_ZERO = 0.06  # of these targets, those that a batch has as many of as of all
@@ -679,22 +680,19 @@ def _unsafe_margin(work: Workspace, seen: Tensor, unsafe: Tensor) -> Callable[[T
 
     In three dimensions and more, samples lie too far apart for the distance to the nearest of them.
     """
-    g = torch.Generator().manual_seed(work.seed + 66_000)
+    s = work.config
+    near = ~unsafe & (nearest_distance(seen, seen[unsafe]) < _DEPTH)
+    rows = [part.nonzero()[:, 0] for part in (unsafe, near if bool(near.any()) else ~unsafe)]
+    loop = InnerLoop(work.seed + 66_000)
     with torch.random.fork_rng():
         torch.manual_seed(work.seed + 66_001)
-        net = nn.Sequential(nn.Linear(seen.shape[1], 64), nn.SiLU(), nn.Linear(64, 64), nn.SiLU(), nn.Linear(64, 1))
-    near = nearest_distance(seen, seen[unsafe]) < _DEPTH
-    rows = [part.nonzero()[:, 0] for part in (unsafe, near & ~unsafe)]
-    optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _SEPARATE)
-    label, weight = torch.cat([-torch.ones(1024), torch.ones(1024)]), torch.cat([torch.full((1024,), _UNSAFE_FIRST), torch.ones(1024)])
-    for _ in range(_SEPARATE):
-        z = torch.cat([seen[r[torch.randint(len(r), (1024,), generator=g)]] for r in rows])
-        loss = (weight * F.softplus(-label * net(z)[:, 0])).mean()
-        optimizer.zero_grad()
-        loss.backward()
-        optimizer.step()
-        schedule.step()
+        net = mlp((seen.shape[1], 64, 64, 1), nn.SiLU)
+
+        def step() -> dict[str, Tensor]:
+            inner, outer = (net(seen[r[loop.pick(len(r), s.batch)]]) for r in rows)
+            return {"loss_unsafe": _UNSAFE_FIRST * F.softplus(inner).mean(), "loss_rest": F.softplus(-outer).mean()}
+
+        loop(min(_SEPARATE, s.fit_steps), {net: 5e-3}, step)
     net.requires_grad_(False)
 
     def margin(latent: Tensor) -> Tensor:

@@ -6,26 +6,29 @@ import base64
 import errno
 import html
 import io
+import itertools
 import json
 import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing, nullcontext
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDict
 from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_sspl.configs.reader import EnvFactory, compose
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.blocks import described_system
+from torchrl_sspl.evaluation.controllers import Decision
+from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.runtime import CameraFault, Monitor, Shield, Verdict, Watched
 from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
@@ -48,16 +51,8 @@ VERDICTS = {
 }
 
 
-class Shown(NamedTuple):
-    """What a source shows at a step."""
-
-    pixels: Tensor  # (1, 6, H, W) uint8
-    begins: bool  # whether an episode begins
-    unsafe: bool | None = None  # whether the true state lies in U, where it is known
-
-
-#: Shows, and takes the action ``(1, m)`` that is done.
-Source = Generator[Shown, Tensor, None]
+class _Over(Exception):
+    """All steps that were asked for are done."""
 
 
 def watch(
@@ -104,26 +99,31 @@ def watch(
     agent = monitor.agent
     shield = Shield(agent, margin=None if agent.tolerated_error > 0.0 else UNPROVED_MARGIN) if protect else None
     if video is None:
-        source, pace = _of_system(agent, env, noise, seed)
+        run, pace = _of_system(agent, env, seed)
     else:
-        source, pace = _of_film(Path(video), _size(agent))
+        run, pace = _of_film(Path(video), _size(agent))
     where = "a film" if video is not None else {None: "its own system", PHYSICS: "full physics"}.get(env, env)
     about = f"{where}; {'random actions' if policy == 'random' else 'its own actions'}; safety filter {'on' if protect else 'off'}"
-    loop = _Loop(monitor, shield, source, policy == "random", seed)
     feed = Feed()
     server = _serve(host, port, feed, PAGE.replace("{{name}}", html.escape(name)).replace("{{about}}", html.escape(about)))
-    film = None
+    film, period, due = None, 1.0 / (fps or pace), time.monotonic()
+
+    def show(event: dict[str, Any], frame: NDArray[np.uint8]) -> None:
+        nonlocal due
+        if film is not None:
+            film.add(event, frame)
+        feed.publish(event, picture_data(frame))
+        due = max(due + period, time.monotonic())
+        time.sleep(max(0.0, due - time.monotonic()))
+
+    camera = CameraFault("dark", 1.0, noise=noise if video is None else 0.0, seed=seed)
+    view = _View(monitor, shield, camera, show, steps, random=policy == "random", seed=seed)
     try:
         film = None if record is None else _Film(Path(record), min(fps or pace, 60.0), f"{name}: {about}")
         ready(f"http://{host}:{server.server_address[1]}/")
-        period, due = 1.0 / (fps or pace), time.monotonic()
-        for event, frame in loop.run(steps):
-            if film is not None:
-                film.add(event, frame)
-            feed.publish(event, picture_data(frame))
-            due = max(due + period, time.monotonic())
-            time.sleep(max(0.0, due - time.monotonic()))
-    except KeyboardInterrupt:
+        due = time.monotonic()
+        run(view)
+    except (_Over, KeyboardInterrupt):
         pass
     finally:
         feed.close()
@@ -131,7 +131,7 @@ def watch(
         server.server_close()
         if film is not None:
             film.close()
-    return loop.counts
+    return view.counts
 
 
 def _check(
@@ -161,8 +161,8 @@ def _size(agent: Agent) -> tuple[int, int]:
     return int(size[0]), int(size[1])
 
 
-def _of_system(agent: Agent, env: str | None, noise: float, seed: int) -> tuple[Source, float]:
-    """Pictures of a system, and its steps per second."""
+def _of_system(agent: Agent, env: str | None, seed: int) -> tuple[Callable[[_View], None], float]:
+    """What lets a view act in a system, episode after episode, and the steps per second of the system."""
     factory = described_system(agent.description) if env in (None, PHYSICS) else EnvFactory(compose([f"env={env}"]).env)
     if factory is None:
         raise ConfigError("expected an agent that names a system of this library, received another one; name one: --env")
@@ -175,53 +175,25 @@ def _of_system(agent: Agent, env: str | None, noise: float, seed: int) -> tuple[
         raise ConfigError(
             f"expected a system with pictures of {_size(agent)} pixels and {m} actions, as this agent's, received {shown} and {dim}"
         )
-    known = hasattr(made, "dynamics")
+    known, world = hasattr(made, "dynamics"), made
     begin = starts(agent, made, _STARTS, torch.Generator().manual_seed(seed)) if known else None
-    pace = 1.0 / float(getattr(made, "dt", 0.05))
-    camera = CameraFault("dark", 1.0, noise=noise, seed=seed)
-    if env != PHYSICS:
-        return _episodes(made, begin, camera), pace
-    make = made.physics() if known else None
-    if make is None:
-        raise ConfigError(f"expected a system with a full physics, received {type(made).__name__}, which has none; leave --env physics out")
-    return _walks(make(), begin, camera), pace
+    if env == PHYSICS:
+        make = made.physics() if known else None
+        if make is None:
+            raise ConfigError(f"expected a system with a full physics, received {type(made).__name__}, which has none; leave --env physics out")
+        world = make()
+
+    def run(view: _View) -> None:
+        with closing(world) if env == PHYSICS else nullcontext():
+            for k in itertools.count():
+                where: dict[str, Any] = {"episodes": 1} if begin is None else {"start": begin[k % len(begin)][None]}
+                simulate(view, world, horizon=_HORIZON - 1, watch=view.tell, **where)
+
+    return run, 1.0 / float(getattr(made, "dt", 0.05))
 
 
-def _episodes(env: Any, begin: Tensor | None, camera: CameraFault) -> Source:
-    """Episodes of a TorchRL environment, from given states or its own resets, through a camera."""
-    k = 0
-    while True:
-        if begin is None:
-            data = env.reset()
-        else:
-            data = env.reset(TensorDict({"state": begin[k % len(begin)][None]}, [1]), set_state=True)
-        k += 1
-        for t in range(_HORIZON):
-            action = yield Shown(camera(data["pixels"], t), t == 0, bool((data["region"] == UNSAFE).any()))
-            data = env.step(data.set("action", action))["next"]
-            if bool(data["done"].any()):
-                break
-
-
-def _walks(world: Any, begin: Tensor | None, camera: CameraFault) -> Source:
-    """Episodes in full physics, through a camera."""
-    assert begin is not None
-    k = 0
-    try:
-        while True:
-            pixels, info = world.reset(options={"pose": begin[k % len(begin)].tolist()})
-            k += 1
-            for t in range(_HORIZON):
-                action = yield Shown(camera(torch.as_tensor(pixels)[None], t), t == 0, bool(info["unsafe"]))
-                pixels, _, terminated, truncated, info = world.step(action[0].numpy())
-                if terminated or truncated:
-                    break
-    finally:
-        world.close()
-
-
-def _of_film(path: Path, size: tuple[int, int]) -> tuple[Source, float]:
-    """Pairs of frames of a film, the middle square of each averaged to a size, and its frames per second."""
+def _of_film(path: Path, size: tuple[int, int]) -> tuple[Callable[[_View], None], float]:
+    """What shows a view the pairs of frames of a film, the middle square of each averaged to a size, and its frames per second."""
     ffmpeg = require("imageio_ffmpeg")
     frames = ffmpeg.read_frames(str(path), pix_fmt="rgb24")
     try:
@@ -232,47 +204,45 @@ def _of_film(path: Path, size: tuple[int, int]) -> tuple[Source, float]:
     side = min(width, height)
     top, left = (height - side) // 2, (width - side) // 2
 
-    def pairs() -> Source:
+    def run(view: _View) -> None:
         before = None
+        view.reset()
         for data in frames:
             picture = torch.frombuffer(bytearray(data), dtype=torch.uint8).reshape(height, width, 3)
             square = picture[top : top + side, left : left + side].permute(2, 0, 1)[None].float()
             frame = F.interpolate(square, size=size, mode="area").round().to(torch.uint8)
             if before is not None:
-                yield Shown(torch.cat([before[0], frame], 1), before[1])
-            before = frame, before is None
+                view.tell(view.step(torch.cat([before, frame], 1)), None)
+            before = frame
 
-    return pairs(), float(about.get("fps") or 20.0)
+    return run, float(about.get("fps") or 20.0)
 
 
-class _Loop:
-    """Monitor, policy and filter at work on a source; counts what happens."""
+class _View:
+    """Monitor, policy and filter at work on what a camera shows, as what acts; counts what happens, and shows it."""
 
-    def __init__(self, monitor: Monitor, shield: Shield | None, source: Source, random: bool, seed: int) -> None:
-        self.monitor, self.shield, self.source, self.random = monitor, shield, source, random
+    reads = "pixels"
+
+    def __init__(
+        self, monitor: Monitor, shield: Shield | None, camera: CameraFault, show: Callable[[dict[str, Any], NDArray[np.uint8]], None],
+        steps: int | None, *, random: bool, seed: int,
+    ) -> None:  # fmt: skip
+        self.monitor, self.shield, self.camera, self.show, self.steps, self.random = monitor, shield, camera, show, steps, random
         self.scale: Tensor = monitor.agent.policy.action_scale.flatten()  # type: ignore[operator, union-attr, assignment]
         self.generator, self.held = torch.Generator().manual_seed(seed), torch.zeros(1, len(self.scale))
         self.counts = {"steps": 0, "interventions": 0, "alarms": 0, "entered": 0}
-        self.episode, self.was_unsafe, self.missed = 0, False, 0
+        self.episode, self.t, self.was_unsafe, self.missed = 0, 0, False, 0
+        self.news: tuple[dict[str, Any], NDArray[np.uint8]] | None = None  # what is not shown yet
 
-    def run(self, steps: int | None) -> Iterator[tuple[dict[str, Any], NDArray[np.uint8]]]:
-        """What happens at every step, and the frame ``(H, W, 3)`` that is seen."""
-        try:
-            shown = next(self.source, None)
-            while shown is not None and (steps is None or self.counts["steps"] < steps):
-                action, event = self._step(shown)
-                yield event, shown.pixels[0, 3:].permute(1, 2, 0).numpy()
-                shown = self.source.send(action)
-        except StopIteration:
-            pass  # the film is over
-        finally:
-            self.source.close()
+    def reset(self, rows: Tensor | None = None) -> None:
+        """An episode begins."""
+        self.monitor.reset()
+        self.episode, self.t, self.was_unsafe, self.missed = self.episode + 1, 0, False, 0
 
-    def _step(self, shown: Shown) -> tuple[Tensor, dict[str, Any]]:
-        if shown.begins:
-            self.monitor.reset()
-            self.episode, self.was_unsafe, self.missed = self.episode + 1, False, 0
-        out, counts = self.monitor.step(shown.pixels), self.counts
+    def step(self, observation: Tensor, rows: Tensor | None = None) -> Decision:
+        """The action for pictures ``(1, 6, H, W)``."""
+        pixels = self.camera(observation, self.t)
+        out, counts = self.monitor.step(pixels), self.counts
         if self.random and float(torch.rand(1, generator=self.generator)) < _HELD:
             self.held = (torch.rand(1, len(self.scale), generator=self.generator) * 2 - 1) * self.scale
         wanted = self.held if self.random else out.action
@@ -283,16 +253,28 @@ class _Loop:
         counts["steps"] += 1
         counts["interventions"] += intervened
         counts["alarms"] += bool(out.alarm)
-        counts["entered"] += bool(shown.unsafe) and not self.was_unsafe
-        self.was_unsafe |= bool(shown.unsafe)
         self.missed += int(out.verdict) == Verdict.INSIDE
         label, colour = VERDICTS[Verdict(int(out.verdict))]
-        return taken, {
-            **counts, "step": counts["steps"], "episode": self.episode, "begins": shown.begins, "unsafe": shown.unsafe,
+        event = {
+            "step": counts["steps"], "episode": self.episode, "begins": self.t == 0,
             "barrier": _number(out.barrier), "verdict": Verdict(int(out.verdict)).name, "label": label, "colour": colour,
             "why": self._why(out), "alarm": bool(out.alarm), "intervened": intervened, "protected": made is not None,
             "wanted": [_number(u) for u in wanted[0]], "taken": [_number(u) for u in taken[0]],
         }  # fmt: skip
+        self.t, self.news = self.t + 1, (event, pixels[0, 3:].permute(1, 2, 0).numpy())
+        return Decision(taken)
+
+    def tell(self, decision: Decision, region: Tensor | None) -> None:
+        """Shows what a step has brought, and whether the true state lies in U, where it is known."""
+        if self.news is None:  # nobody looked: whoever has left is not shown
+            return
+        (event, frame), self.news = self.news, None
+        unsafe = None if region is None else bool((region == UNSAFE).any())
+        self.counts["entered"] += bool(unsafe) and not self.was_unsafe
+        self.was_unsafe |= bool(unsafe)
+        self.show(self.counts | event | {"unsafe": unsafe}, frame)
+        if self.counts["steps"] == self.steps:
+            raise _Over
 
     def _why(self, out: Watched) -> str:
         """The number behind a verdict."""
@@ -472,4 +454,4 @@ class _Film:
         self.writer.close()
 
 
-__all__ = ["POLICIES", "Feed", "Shown", "picture_data", "watch"]
+__all__ = ["POLICIES", "Feed", "picture_data", "watch"]
