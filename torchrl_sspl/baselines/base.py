@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
@@ -107,6 +108,7 @@ class SafetyMethod(ABC):
         records: whether ``fit`` takes a recording.
         needs: what it was given, complete after ``fit``.
         notes: figures of its own training.
+        directory: where a training of its own may write; None: nowhere.
         Config: dataclass of its options.
 
     Source: none.
@@ -134,6 +136,7 @@ class SafetyMethod(ABC):
     def __init__(self, config: Any = None) -> None:
         self.config: Any = config if config is not None or self.Config is None else self.Config()
         self.notes: dict[str, float] = {}
+        self.directory: Path | None = None
 
     @abstractmethod
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:

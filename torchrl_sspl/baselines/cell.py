@@ -133,6 +133,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         from torchrl_sspl import __version__
 
         env, method, budget = cell.environment(), make(cell.method, cell.options), BUDGETS.get(cell.budget)
+        method.directory = directory
         clock = [time.perf_counter()]
         data = record(env, budget, cell.seed) if budget is not None and method.learns and method.records else None
         clock.append(time.perf_counter())

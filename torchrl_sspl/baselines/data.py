@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from torchrl_sspl.baselines.base import Budget
-from torchrl_sspl.data import collect_random
+from torchrl_sspl.data import TransitionStore, collect_random
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
 from torchrl_sspl.seeds import spawn
@@ -85,6 +85,16 @@ class Recording:
         return Recording(**{f.name: torch.cat([getattr(self, f.name), getattr(other, f.name)]) for f in fields(self)})
 
 
+def of_store(store: TransitionStore, size: int = POOL) -> Recording:
+    """What a store with true states holds, pictures pooled. Source: none."""
+    batch = store.get(slice(None))
+    frames = batch["frames"]
+    return Recording(
+        pooled(frames.flatten(1, 2), size).reshape(len(frames), 3, 3, size, size), batch["action"],
+        batch["region"][:, 0], batch["next", "region"][:, 0], batch["info", "state"], batch["info", "next_state"],
+    )  # fmt: skip
+
+
 def record(env: SafetyEnv, budget: Budget, seed: int, *, size: int = POOL) -> Recording:
     """Records a budget: episodes of a few steps under random actions, from anywhere, from outside U, from S and from U.
 
@@ -117,15 +127,11 @@ def record(env: SafetyEnv, budget: Budget, seed: int, *, size: int = POOL) -> Re
             store = collect_random(
                 env, len(size_of_part), seed=spawn(seed, "data", number), steps=steps, region=region, keep_state=True
             )
-            batch, number = store.get(slice(None)), number + 1
-            frames = batch["frames"]
-            parts.append(Recording(
-                pooled(frames.flatten(1, 2), size).reshape(len(frames), 3, 3, size, size), batch["action"],
-                batch["region"][:, 0], batch["next", "region"][:, 0], batch["info", "state"], batch["info", "next_state"],
-            ))  # fmt: skip
+            parts.append(of_store(store, size))
+            number += 1
     if not parts:
         raise ConfigError(f"budget: expected at least one transition, received {budget}")
     return Recording(**{f.name: torch.cat([getattr(p, f.name) for p in parts]) for f in fields(Recording)})
 
 
-__all__ = ["POOL", "Recording", "pooled", "record"]
+__all__ = ["POOL", "Recording", "of_store", "pooled", "record"]

@@ -21,6 +21,14 @@ METHODS = {
     "cone": "ceilings:CollisionCone",
     "turning_circle": "ceilings:TurningCircle",
     "kernel": "ceilings:TrueKernel",
+    "imitation": "imitation:Imitation",
+    "nerf_cbf": "nerf_cbf:NeRFCBF",
+    "vision_cbf": "vision_cbf:VisionCBF",
+    "neural_cbf": "neural_cbf:NeuralCBF",
+    "latent_cbf": "latent_cbf:LatentCBF",
+    "latent_safe": "latent_safe:LatentSafe",
+    "smooth_latent": "smooth_latent:SmoothLatent",
+    "sspl": "sspl:SSPL",
 }
 
 
