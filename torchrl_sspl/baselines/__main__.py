@@ -12,7 +12,11 @@ from torchrl_sspl.errors import SSPLError
 _USAGE = """python -m torchrl_sspl.baselines METHOD [env=pendulum|dubins] [budget=small|full] [seed=0] [out_dir=...] [key=value ...]
 
 Fits a method, measures it and prints the row; score.episodes=... and the like are sizes of the measurement. What has been
-measured is read again, not measured again. METHOD is one of:
+measured is read again, not measured again.
+
+python -m torchrl_sspl.baselines table [methods=NAME,NAME:key=value] [env=pendulum,dubins] [budget=small] [seed=0,1,2] [run=false]
+
+Runs the cells that are missing and writes runs/baselines/table.md. METHOD is one of:
 """
 
 
@@ -24,6 +28,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(_USAGE + "\n".join(lines))
         return 0 if words else 2
     try:
+        if words[0] == "table":
+            from torchrl_sspl.baselines import table
+
+            return table.main(words[1:])
         print(text(run_cell(Cell.of(words[0], words[1:]))))
     except SSPLError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +15,15 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_sspl.baselines.base import BUDGETS
-from torchrl_sspl.baselines.data import record
+from torchrl_sspl.baselines.data import Recording, record
 from torchrl_sspl.baselines.registry import kind_of, make
-from torchrl_sspl.baselines.score import ScoreConfig, score
+from torchrl_sspl.baselines.score import ScoreConfig, score, sizes_of
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, OutputError
 from torchrl_sspl.files import RunDirectory, write
 from torchrl_sspl.seeds import spawn
+from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
 ROW_FILE = "row.json"
 SCHEMA = 1
@@ -115,6 +117,19 @@ def stored(cell: Cell) -> dict[str, Any] | None:
     return row
 
 
+@functools.lru_cache(maxsize=1)
+def _recorded(env: str, budget: str, seed: int) -> Recording:
+    """One recording serves all methods of a system, a budget and a seed."""
+    return record(Cell("kernel", env, seed=seed).environment(), BUDGETS[budget], seed)
+
+
+@functools.lru_cache(maxsize=2)
+def _kernel(env: str, nodes: int) -> ViabilityKernel:
+    """One true kernel serves all methods of a system."""
+    made = Cell("kernel", env).environment()
+    return viability_kernel(made, resolution=sizes_of(made.system.kernel_grid, nodes))
+
+
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Record, fit, score, write; or read what an earlier call has written.
 
@@ -135,7 +150,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         env, method, budget = cell.environment(), make(cell.method, cell.options), BUDGETS.get(cell.budget)
         method.directory = directory
         clock = [time.perf_counter()]
-        data = record(env, budget, cell.seed) if budget is not None and method.learns and method.records else None
+        data = _recorded(cell.env, cell.budget, cell.seed) if budget is not None and method.learns and method.records else None
         clock.append(time.perf_counter())
         used = time.process_time()
         with torch.random.fork_rng():
@@ -143,7 +158,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
             method.fit(data, env, budget or BUDGETS["tiny"], cell.seed)
         used = time.process_time() - used
         clock.append(time.perf_counter())
-        found = score(method, env, replace(cell.score))
+        found = score(method, env, cell.score, kernel=_kernel(cell.env, cell.score.kernel_grid))
         clock.append(time.perf_counter())
         minutes = {name: (b - a) / 60 for name, a, b in zip(("data", "fit", "score"), clock, clock[1:], strict=False)}
         row = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -76,7 +77,7 @@ class Recording:
         """Number of observations at t that carry a label."""
         return int((self.region == code).sum())
 
-    def labels(self) -> dict[str, int]:
+    def labels(self) -> dict[str, Any]:
         """The part of the ledger that every learned method shares."""
         return {"transitions": len(self), "safe_labels": self.count(SAFE), "unsafe_labels": self.count(UNSAFE)}
 

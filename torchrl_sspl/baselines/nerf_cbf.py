@@ -30,6 +30,7 @@ from torchrl_sspl.errors import ConfigError
 
 _TABLE = 97  # nodes of the table of distances, per side
 _RAYS = 2048  # pixels per step
+_EMPTY = 0.01  # price of what stops the light: a picture alone does not tell white from nothing
 _OPAQUE = 0.5  # share of the light that a place has to stop to count as occupied
 
 
@@ -43,7 +44,7 @@ class Field(nn.Module):
         [torch.Size([5, 3]), torch.Size([5, 1])]
     """
 
-    def __init__(self, bands: int = 6) -> None:
+    def __init__(self, bands: int = 4) -> None:  # six, as published, wave between the pixels of 32 x 32
         super().__init__()
         self.bands = math.pi * 2.0 ** torch.arange(bands)
         self.net = mlp_of(2 + 4 * bands, 64, 64, 4)
@@ -60,26 +61,30 @@ class Scene(nn.Module):
 
     Args:
         env: the system, of which pose and size of the picture are taken.
+        ground: colour ``(3,)`` of the background in [0, 1]; what looks like it is taken for empty.
     """
 
-    def __init__(self, env: SafetyEnv) -> None:
+    ground: Tensor
+
+    def __init__(self, env: SafetyEnv, ground: Tensor) -> None:
         super().__init__()
         if not isinstance(env, PixelPendulumEnv | DubinsEnv) or env.state_dim > 3:
             raise ConfigError(f"expected a pendulum or a Dubins car without a yaw lag, received {type(env).__name__}")
         self.view = 1.2 * env.arena_half_size if isinstance(env, DubinsEnv) else 2.2
         self.car = isinstance(env, DubinsEnv)
-        self.still, self.robot, self.ground = Field(), Field(), nn.Parameter(torch.zeros(3))
+        self.still, self.robot = Field(), Field()
+        self.register_buffer("ground", ground)
 
-    def forward(self, place: Tensor, state: Tensor) -> Tensor:
-        """Colours ``(n, 3)`` at places ``(n, 2)`` in the picture, each with its state ``(n, s)``."""
+    def forward(self, place: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Colours ``(n, 3)`` at places ``(n, 2)`` in the picture, each with its state ``(n, s)``, and how much stops the light."""
         heading = state[:, 2] if self.car else state[:, 0]
         centre = state[:, :2] / self.view if self.car else torch.zeros_like(state)
         cos, sin = heading.cos(), heading.sin()
         x, y = (place - centre).unbind(-1)
         own = torch.stack([cos * x + sin * y, cos * y - sin * x], -1)
         (near, stops), (far, blocks) = self.robot(own), self.still(place)
-        behind = blocks * far + (1 - blocks) * self.ground.sigmoid()
-        return stops * near + (1 - stops) * behind
+        behind = blocks * far + (1 - blocks) * self.ground
+        return stops * near + (1 - stops) * behind, stops + blocks
 
 
 @dataclass
@@ -117,7 +122,7 @@ class NeRFCBF(OneStepFilter):
         """Learn the field from posed pictures; see :meth:`SafetyMethod.fit`."""
         c = self.config
         self.env, self.alpha, self.grid = env, c.alpha, c.actions
-        self.scene = Scene(env)
+        self.scene = Scene(env, data.frames[:200, 1].float().permute(1, 0, 2, 3).flatten(1).median(1).values / 255.0)
         self._learn(data, seed)
         if self.scene.car:
             self._tabulate()
@@ -142,8 +147,8 @@ class NeRFCBF(OneStepFilter):
             wanted = frames[rows, :, row, column].float()
             place = torch.stack([axis[column], -axis[row]], -1)
             heavy = 1.0 + 9.0 * ((wanted - median[:, row, column].T).abs().amax(-1, keepdim=True) > 8.0)
-            told = self.scene(place, data.state[rows])
-            return {"loss": (heavy * (told - wanted / 255.0).square()).mean()}
+            told, stops = self.scene(place, data.state[rows])
+            return {"loss": (heavy * (told - wanted / 255.0).square()).mean(), "loss_empty": _EMPTY * stops.mean()}
 
         loop = train(seed, self.config.steps, {self.scene: 5e-3}, loss, len(data), _RAYS)
         self.notes["field_loss"] = float(loop.loss or 0.0)

@@ -169,7 +169,7 @@ def score(
         if getattr(sizes, name) < 1:
             raise ConfigError(f"score.{name}: expected at least 1, received {getattr(sizes, name)}; 0 in the configuration: the default")
     if kernel is None:
-        kernel = viability_kernel(env, resolution=_sizes(env.system.kernel_grid, given.kernel_grid))
+        kernel = viability_kernel(env, resolution=sizes_of(env.system.kernel_grid, given.kernel_grid))
     it = _Score(method, env, kernel, sizes, Evaluation())
     barrier = _sets(it)
     if barrier is not None:
@@ -179,8 +179,13 @@ def score(
     return it.out
 
 
-def _sizes(own: int | tuple[int, ...], n: int) -> int | tuple[int, ...]:
-    """Of a grid: the system's own, or n along its finest coordinate and the others in proportion."""
+def sizes_of(own: int | tuple[int, ...], n: int) -> int | tuple[int, ...]:
+    """Nodes of a grid: the system's own, or n along its finest coordinate and the others in proportion. Source: none.
+
+    Example:
+        >>> sizes_of((61, 61, 37), 31)
+        (31, 31, 19)
+    """
     if isinstance(own, int) or not n:
         return n or own
     return tuple(max(2, round(k * n / max(own))) for k in own)
@@ -193,7 +198,7 @@ def _inside(it: _Score, state: Tensor) -> Tensor:
 
 def _sets(it: _Score) -> tuple[Tensor, Tensor, Tensor] | None:
     """The claimed set on a grid: barrier, kernel, U, one value for each node."""
-    sizes = _sizes(it.env.system.state_grid, it.config.grid)
+    sizes = sizes_of(it.env.system.state_grid, it.config.grid)
     states: Tensor = it.env.state_space.grid(sizes)  # type: ignore[attr-defined]
     viable, unsafe = it.kernel.contains(states), it.env.unsafe_set.contains(states)
     barrier = barrier_on(it.method, it.env, states)
@@ -288,4 +293,4 @@ def _latency(it: _Score) -> None:
         it.out.add(Measurement(name, value, "ms", len(ordered), note=f"{torch.get_num_threads()} thread(s), action and claim"))
 
 
-__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "score", "well_inside"]
+__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "score", "sizes_of", "well_inside"]
