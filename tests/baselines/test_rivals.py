@@ -106,6 +106,18 @@ def test_a_training_needs_a_directory(systems):
         make("sspl").fit(None, systems["pendulum"][0], BUDGETS["tiny"], 0)
 
 
+def test_its_own_training_takes_the_budget_and_no_rollouts(tmp_path, systems):
+    sizes = "overrides=[preset=smoke,synthesis.check_episodes=20,trainer.optim_steps_per_batch=2,env.image_size=32]"
+    method = make("sspl", [sizes])
+    method.directory = tmp_path
+    env = PendulumEnv([4], image_size=32)
+    method.fit(None, env, BUDGETS["tiny"], 0)
+    assert method.needs.transitions == 1280  # one batch
+    assert method.needs.rollouts == 0
+    assert (tmp_path / "run" / "agent" / "agent.json").is_file()
+    assert method.act(env.observe(torch.zeros(2, 2)), torch.zeros(2, 1))[0].shape == (2, 1)
+
+
 @pytest.mark.parametrize("task", ["pendulum", "dubins"])
 def test_the_expert_keeps_the_common_set(task, systems):
     env, kernel, _ = systems[task]

@@ -2,7 +2,8 @@ r"""This library's own method as a row: an agent trained by the library's own ru
 
 ``agent=pendulum`` and ``agent=quadruped`` are the shipped ones, trained with more than the full budget counts (their own is in
 the ledger). Without ``agent`` the run of ``env=...`` is trained with the transitions of the budget; the small one takes one round
-without rollouts of its own. The agent's policy acts by itself; ``filter=true`` puts its safety filter behind the nominal policy.
+without rollouts of its own, and so without the memory that the shipped pendulum has. Labels are fewer than the budget allows: of
+episodes that start in S or U some leave it. The agent's policy acts by itself; ``filter=true`` puts its safety filter behind the nominal policy.
 """
 
 from __future__ import annotations
@@ -85,6 +86,8 @@ class SSPL(SafetyMethod):
             plan += [
                 f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}",
                 f"synthesis.transitions={frames}", "synthesis.rounds=1", "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
+                # A memory, and what is proved of it, are learnt from rollouts.
+                "synthesis.gain=1.0", "synthesis.tolerated_error=0.0", "synthesis.cover_share=0.0",
             ]  # fmt: skip
         experiment = Experiment(compose([*plan, *self.config.overrides]))
         agent = experiment.train().cpu()
