@@ -106,6 +106,16 @@ def test_a_training_needs_a_directory(systems):
         make("sspl").fit(None, systems["pendulum"][0], BUDGETS["tiny"], 0)
 
 
+def test_the_imitator_is_told_about_what_it_visits(systems):
+    env, kernel, _ = systems["pendulum"]
+    budget = Budget("try", 40, 8, 8, rollouts=24)
+    method = make("imitation", ["steps=6", "rounds=2"])
+    method.expert = KernelExpert(env, kernel)
+    method.fit(record(env, budget, 0), env, budget, 0)
+    assert method.needs.transitions == method.needs.expert_actions == budget.total
+    assert method.needs.rollouts == 24
+
+
 def test_its_own_training_takes_the_budget_and_no_rollouts(tmp_path, systems):
     sizes = "overrides=[preset=smoke,synthesis.check_episodes=20,trainer.optim_steps_per_batch=2,env.image_size=32]"
     method = make("sspl", [sizes])

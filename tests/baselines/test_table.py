@@ -46,6 +46,7 @@ def test_the_table_runs_what_is_missing_and_only_that(tmp_path, monkeypatch, cap
     assert main(["table", *words]) == 0
     assert path.stat().st_mtime_ns == before
     assert (tmp_path / "runs/baselines/table.md").is_file()
+    assert "not measured" not in table(["run=false", "methods=lqr", "env=pendulum"])  # measured with other sizes, and said so
 
 
 def test_several_seeds_are_a_mean_and_the_worst():

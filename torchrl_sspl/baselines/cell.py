@@ -103,8 +103,15 @@ class Cell:
         return env
 
 
-def stored(cell: Cell) -> dict[str, Any] | None:
-    """The row of a cell, if it has been written; OutputError if the directory holds another one. Source: none."""
+def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
+    """The row of a cell, if it has been written; OutputError if the directory holds another one.
+
+    With ``any_score`` the sizes of its measurement do not matter. Source: none.
+
+    Example:
+        >>> stored(Cell.of("lqr", ["out_dir=runs/nowhere"])) is None
+        True
+    """
     path = cell.directory / ROW_FILE
     if not path.is_file():
         return None
@@ -112,7 +119,8 @@ def stored(cell: Cell) -> dict[str, Any] | None:
         row = json.loads(path.read_text())
     except ValueError as error:
         raise OutputError(f"expected a row in '{path}', received what cannot be read: {error}; remove it") from error
-    if row.get("cell") != cell.describe():
+    found = row.get("cell") or {}
+    if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
         raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; choose another out_dir")
     return row
 
