@@ -66,6 +66,13 @@ def test_several_seeds_are_a_mean_and_the_worst():
     assert "✗ ✗ ✗ ✗ ✓ ✗" in text
 
 
+def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():
+    asked = cells(["methods=sspl:agent=pendulum,sspl", "env=pendulum"])
+    text = markdown([(cell, "not measured") for cell in asked])
+    assert "| sspl agent=pendulum | its own |" in text
+    assert "| sspl | small |" in text
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -121,7 +121,8 @@ def markdown(rows: Sequence[tuple[Cell, dict[str, Any] | str]]) -> str:
         several: dict[tuple[str, str], list[dict[str, Any] | str]] = {}
         for cell, row in group:
             label = " ".join([cell.method, *cell.options])
-            several.setdefault((label, cell.budget), []).append(row)
+            trained = any(option.startswith("agent=") for option in cell.options)
+            several.setdefault((label, "its own" if trained else cell.budget), []).append(row)
         head = ["method", "budget", *(c[0] for c in _MEASURED), "latency p50 / p99", "episodes"]
         lines = [_line(head), _line(["---"] * len(head))]
         needs = ["method", "budget", *(c[0] for c in _NEEDED), "training, CPU min", "proved", "paper: " + ", ".join(_TICK_NAMES)]
