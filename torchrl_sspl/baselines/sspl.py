@@ -1,7 +1,6 @@
 r"""This library's own method as a row: an agent trained by the library's own run, or one that has been trained before.
 
-``agent=pendulum`` and ``agent=quadruped`` are the shipped ones, trained with more than the full budget counts (their own is in
-the ledger). Without ``agent`` the run of ``env=...`` is trained with the transitions of the budget; the small one takes one round
+``agent=pendulum`` and ``agent=quadruped`` are the shipped ones, trained with a budget of their own, which is in the ledger. Without ``agent`` the run of ``env=...`` is trained with the transitions of the budget; the small one takes one round
 without rollouts of its own, and so without the memory that the shipped pendulum has. Labels are fewer than the budget allows: of
 episodes that start in S or U some leave it. The agent's policy acts by itself; ``filter=true`` puts its safety filter behind the nominal policy.
 """
