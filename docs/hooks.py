@@ -40,6 +40,7 @@ SECTIONS = {  # in the order of the floors, from the mathematics to the tools
     "trainers": "Training",
     "viz": "Figures and reports",
     "experiments": "Experiments",
+    "baselines": "Other methods",
     "configs": "Configuration",
     "cli": "Command line",
     "devices": "Devices",

@@ -18,7 +18,7 @@ FLOORS = {
     "lipschitz": 1,
     "modules": 2, "envs": 2, "certification": 2,
     "viability": 2, "configs": 2, "objectives": 3, "data": 3,
-    "evaluation": 4, "trainers": 5, "runtime": 5, "viz": 5, "experiments": 6, "cli": 7, "__main__": 7,
+    "evaluation": 4, "trainers": 5, "runtime": 5, "viz": 5, "experiments": 6, "baselines": 6, "cli": 7, "__main__": 7,
 }  # fmt: skip
 HEAVY = ("pybullet", "wandb", "hydra", "ray", "matplotlib", "scipy", "torchrl")
 FILES = sorted(PACKAGE.rglob("*.py"))

@@ -24,8 +24,9 @@ if "SSPL/QuadrupedObstacle-v0" not in gymnasium.registry:
     )
 
 _SUBPACKAGES = (
-    "certification", "configs", "data", "envs", "errors", "evaluation", "experiments", "functional", "lipschitz", "modules",
-    "objectives", "runtime", "sets", "trainers", "viability", "viz",
+    "baselines", "certification", "configs", "data", "envs", "errors", "evaluation", "experiments", "functional", "lipschitz", "modules",
+    "objectives",
+    "runtime", "sets", "trainers", "viability", "viz",
 )  # fmt: skip
 _NAMES = {
     "Agent": "modules.agent",

@@ -1,0 +1,98 @@
+"""Cells: what determines a row, what is written, what is refused."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from torchrl_sspl.baselines.__main__ import main
+from torchrl_sspl.baselines.base import BUDGETS, Budget, Needs
+from torchrl_sspl.baselines.cell import ROW_FILE, Cell, run_cell, text
+from torchrl_sspl.baselines.data import pooled, record
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import ConfigError, DTypeError, OutputError, ShapeError
+from torchrl_sspl.sets import SAFE, UNSAFE
+
+SMALL = ["score.episodes=20", "score.horizon=10", "score.grid=21", "score.kernel_grid=31", "score.frames=2"]
+
+
+def test_a_row_is_written_and_read_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main(["lqr", "env=pendulum", *SMALL]) == 0
+    printed = capsys.readouterr().out
+    path = tmp_path / "runs/baselines/pendulum/none/lqr/0" / ROW_FILE
+    row = json.loads(path.read_text())
+    assert row["measurements"]["false_safe"]["value"] == 0.0
+    assert row["needs"]["dynamics"] == "exact"
+    assert row["cell"]["method"] == "lqr"
+    assert text(row) in printed
+    before = path.stat().st_mtime_ns
+    assert main(["lqr", "env=pendulum", *SMALL]) == 0
+    assert path.stat().st_mtime_ns == before
+
+
+def test_another_row_is_never_overwritten(tmp_path):
+    where = f"out_dir={tmp_path}/row"
+    run_cell(Cell.of("lqr", [where, *SMALL]))
+    with pytest.raises(OutputError, match="choose another out_dir"):
+        run_cell(Cell.of("hocbf", [where, *SMALL]))
+    with pytest.raises(OutputError, match="choose another out_dir"):
+        run_cell(Cell.of("lqr", [where, *SMALL[1:]]))
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("nothing", [], "expected a method"),
+        ("lqr", ["budget=huge"], "expected budget to be one of tiny, small, full"),
+        ("lqr", ["seed=-1"], "expected seed to be an integer"),
+        ("lqr", ["gain=1"], "expected options among"),
+        ("lqr", ["score.episode=1"], "expected score"),
+        ("lqr", ["noise"], "key=value"),
+    ],
+)
+def test_cells_that_are_not_valid_are_refused(name, words, message):
+    with pytest.raises(ConfigError, match=message):
+        Cell.of(name, words)
+
+
+def test_systems_without_a_known_kernel_are_refused(capsys):
+    with pytest.raises(ConfigError, match="whose true kernel is known"):
+        Cell.of("lqr", ["env=quadruped"]).environment()
+    assert main(["nothing"]) == 2
+    assert "expected a method" in capsys.readouterr().err
+    assert main(["--help"]) == 0
+    assert "turning_circle" in capsys.readouterr().out
+
+
+def test_a_recording_holds_what_was_asked_for():
+    env = PendulumEnv([16], seed=3)
+    found = record(env, Budget("try", 40, 12, 20), seed=5)
+    assert len(found) == 72
+    assert (found.region[40:52] == SAFE).all()
+    assert (found.region[52:] == UNSAFE).all()
+    assert torch.allclose(found.next_state, env.wrap(env.dynamics(found.state, found.action)), atol=1e-5)
+    assert torch.equal(found.pixels[:, 3:], found.next_pixels[:, :3])
+    assert torch.equal(found.pixels, pooled(env.observe(found.state)))  # the pendulum's pictures tell the state
+    again = record(env, Budget("try", 40, 12, 20), seed=5)
+    assert torch.equal(found.frames, again.frames)
+    assert found.labels() == {"transitions": 72, "safe_labels": found.count(SAFE), "unsafe_labels": found.count(UNSAFE)}
+    assert len(found.joined(again)) == 144
+
+
+def test_budgets_are_those_of_the_protocol():
+    assert BUDGETS["small"].total == 23_000
+    assert BUDGETS["full"].total == 115_000
+    with pytest.raises(ConfigError, match=r"needs\.dynamics"):
+        Needs(dynamics="some")
+    with pytest.raises(ConfigError, match="at least one transition"):
+        record(PendulumEnv([4]), Budget("none", 0, 0, 0), 0)
+
+
+def test_pictures_of_another_kind_are_refused():
+    with pytest.raises(DTypeError, match="uint8"):
+        pooled(torch.zeros(1, 6, 32, 32))
+    with pytest.raises(ShapeError, match="n, c, H, W"):
+        pooled(torch.zeros(6, 32, 32, dtype=torch.uint8))

@@ -1,0 +1,249 @@
+"""Every method that learns: on a tiny recording, and what is particular to each."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchrl_sspl.baselines import BUDGETS, METHODS, Budget, ScoreConfig, make, record, score
+from torchrl_sspl.baselines.base import nearest_admissible
+from torchrl_sspl.baselines.imitation import KernelExpert
+from torchrl_sspl.baselines.latent_cbf import BoundedAutoencoder, ControlAffine
+from torchrl_sspl.baselines.nerf_cbf import NeRFCBF
+from torchrl_sspl.baselines.neural_cbf import QuadraticBarrier
+from torchrl_sspl.baselines.perception import Coordinates, Perception, perception_error
+from torchrl_sspl.baselines.registry import kind_of
+from torchrl_sspl.baselines.score import adversarial, harmless, well_inside
+from torchrl_sspl.baselines.vision_cbf import Geometry
+from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.evaluation import simulate
+from torchrl_sspl.viability import viability_kernel
+
+TINY = {
+    "imitation": ["steps=6"],
+    "nerf_cbf": ["steps=6"],
+    "vision_cbf": ["steps=4", "batch=16"],
+    "neural_cbf": ["perception_steps=4", "steps=6", "batch=32"],
+    "latent_cbf": ["autoencoder_steps=4", "steps=6"],
+    "latent_safe": ["world_steps=4", "margin_steps=6", "steps=6", "batch=32"],
+    "smooth_latent": ["world_steps=4", "margin_steps=6", "steps=6", "batch=32"],
+}
+SIZES = ScoreConfig(episodes=6, horizon=4, grid=9, frames=2)
+
+
+@pytest.fixture(scope="module")
+def systems():
+    pendulum, car = PendulumEnv([16]), DubinsEnv([16])
+    kernels = viability_kernel(pendulum, resolution=61), viability_kernel(car, resolution=(31, 31, 24))
+    return {
+        "pendulum": (pendulum, kernels[0], record(pendulum, BUDGETS["tiny"], 0)),
+        "dubins": (car, kernels[1], record(car, BUDGETS["tiny"], 0)),
+    }
+
+
+@pytest.mark.parametrize("task", ["pendulum", "dubins"])
+@pytest.mark.parametrize("name", TINY)
+def test_every_method_learns_acts_and_is_scored(name, task, systems):
+    env, kernel, data = systems[task]
+    method = make(name, TINY[name])
+    if name == "imitation":
+        method.expert = KernelExpert(env, kernel)
+    torch.manual_seed(0)
+    method.fit(data, env, BUDGETS["tiny"], 0)
+    state = env.sample_states(5)
+    seen = state if method.reads == "state" else env.observe(state)
+    action, none = method.act(seen, torch.zeros(5, 1))
+    assert action.shape == (5, 1)
+    assert none.shape == (5,)
+    assert none.dtype == torch.bool
+    assert (action.abs() <= env.max_action + 1e-5).all()
+    claims = method.claims(seen)
+    assert (claims is None) == (name == "imitation")
+    assert method.needs.transitions == len(data)
+    found = score(method, env, SIZES, kernel=kernel)
+    assert found["common_harmless_enter"] is not None
+    assert found["latency_p99"] > 0
+
+
+def test_every_method_is_in_the_list_and_learns_or_not():
+    assert {name for name in METHODS if kind_of(name).learns} == {*TINY, "sspl"}
+    assert all(kind_of(name).name == name for name in METHODS)
+
+
+@pytest.mark.parametrize("name", ["latent_cbf", "smooth_latent"])
+def test_the_same_seed_learns_the_same(name, systems):
+    env, _, data = systems["pendulum"]
+    seen, values = env.observe(torch.tensor([[0.3, 0.5]])), []
+    for _ in range(2):
+        torch.manual_seed(3)
+        method = make(name, TINY[name])
+        method.fit(data, env, BUDGETS["tiny"], 3)
+        values.append(method.barrier(seen))
+    assert torch.equal(*values)
+
+
+def test_the_shipped_agent_is_a_row_with_its_memory(systems):
+    env, kernel, _ = systems["pendulum"]
+    for options in (["agent=pendulum"], ["agent=pendulum", "filter=true"]):
+        method = make("sspl", options)
+        method.fit(None, env, BUDGETS["tiny"], 0)
+        found = score(method, env, ScoreConfig(episodes=20, horizon=10, grid=41, frames=2), kernel=kernel)
+        assert found["claimed_over_kernel"] > 0.5
+        assert found["false_safe"] < 0.05
+        assert found["claimed_harmless_enter"] == 0.0
+    assert method.needs.transitions == 84_000
+    acts = method.controller(adversarial(env))
+    run = simulate(acts, env, start=torch.zeros(2, 2), horizon=5)
+    assert acts.deviation > 0
+    assert torch.allclose(run.actions[0], torch.tensor(10.0))  # upright there is room: the adversary's own action
+
+
+def test_a_training_needs_a_directory(systems):
+    with pytest.raises(ConfigError, match="expected a directory"):
+        make("sspl").fit(None, systems["pendulum"][0], BUDGETS["tiny"], 0)
+
+
+def test_the_imitator_is_told_about_what_it_visits(systems):
+    env, kernel, _ = systems["pendulum"]
+    budget = Budget("try", 40, 8, 8, rollouts=24)
+    method = make("imitation", ["steps=6", "rounds=2"])
+    method.expert = KernelExpert(env, kernel)
+    method.fit(record(env, budget, 0), env, budget, 0)
+    assert method.needs.transitions == method.needs.expert_actions == budget.total
+    assert method.needs.rollouts == 24
+
+
+def test_its_own_training_takes_the_budget_and_no_rollouts(tmp_path, systems):
+    sizes = "overrides=[preset=smoke,synthesis.check_episodes=20,trainer.optim_steps_per_batch=2,env.image_size=32]"
+    method = make("sspl", [sizes])
+    method.directory = tmp_path
+    env = PendulumEnv([4], image_size=32)
+    method.fit(None, env, BUDGETS["tiny"], 0)
+    assert method.needs.transitions == 1280  # one batch
+    assert method.needs.rollouts == 0
+    assert (tmp_path / "run" / "agent" / "agent.json").is_file()
+    assert method.act(env.observe(torch.zeros(2, 2)), torch.zeros(2, 1))[0].shape == (2, 1)
+
+
+@pytest.mark.parametrize("task", ["pendulum", "dubins"])
+def test_the_expert_keeps_the_common_set(task, systems):
+    env, kernel, _ = systems[task]
+    expert = KernelExpert(env, kernel)
+    start = env.state_space.sample(3000, torch.Generator().manual_seed(0))
+    start = start[well_inside(kernel, start)]
+    run = simulate(_States(expert), env, start=start, horizon=60)
+    entered = (env.unsafe_set.contains(run.states) & run.alive).any(0).float().mean()
+    assert entered < 0.02  # of a coarse kernel
+    idle = simulate(_States(harmless(env)), env, start=start, horizon=60)
+    assert entered < 0.2 * (env.unsafe_set.contains(idle.states) & idle.alive).any(0).float().mean()
+
+
+class _States:
+    reads = "state"
+
+    def __init__(self, function):
+        self.act = function
+
+
+@pytest.mark.parametrize("env", [PendulumEnv(), DubinsEnv()], ids=["pendulum", "dubins"])
+def test_coordinates_and_geometry_tell_the_state(env):
+    state = env.wrap(env.sample_states(200, torch.Generator().manual_seed(0)))
+    at, of = Coordinates(env), Geometry(env)
+    assert at.features(state).abs().max() <= 0.9 + 1e-5
+    assert torch.allclose(at.state(at.features(state)), state, atol=1e-4)
+    told = of.state(of.draw(state, env.previous_state(state)))
+    error = perception_error(told, state, env)
+    assert max(v for k, v in error.items() if k.endswith("q99")) < 0.12
+    with pytest.raises(ConfigError, match="without a yaw lag"):
+        Coordinates(DubinsEnv(yaw_lag=(0.05, 0.05)))
+
+
+@pytest.mark.parametrize("env", [PendulumEnv(), DubinsEnv()], ids=["pendulum", "dubins"])
+def test_the_geometry_lies_where_the_picture_shows_it(env):
+    from torchrl_sspl.baselines.data import pooled
+
+    state = torch.tensor([[0.6, 0.0]]) if env.state_dim == 2 else torch.tensor([[1.2, -0.5, 0.4]])
+    of, empty = Geometry(env), env.draw(state.clone().fill_(math.pi if env.state_dim == 2 else -1.6))
+    changed = (pooled(env.draw(state)).float() - pooled(empty).float()).abs().sum(1)[0]
+    x, y = of.place(state)[0]
+    i, j = round(float((y + 1) / 2 * 32 - 0.5)), round(float((x + 1) / 2 * 32 - 0.5))
+    assert changed[max(0, i - 1) : i + 2, max(0, j - 1) : j + 2].max() > 60
+
+
+def test_the_state_is_learnt_from_pictures(systems):
+    env = PendulumEnv([16])
+    data = record(env, Budget("try", 400, 0, 0), 1)
+    torch.manual_seed(0)
+    few, more = (perception_error(Perception(env, data, n, 0)(data.pixels), data.state, env)["x0_q50"] for n in (2, 60))
+    assert more < 0.5 * few
+
+
+def test_the_field_finds_the_obstacle():
+    env = DubinsEnv([16])
+    data = record(env, Budget("try", 300, 0, 0), 1)
+    torch.manual_seed(0)
+    method: NeRFCBF = make("nerf_cbf", ["steps=150", "form=closing"])
+    method.fit(data, env, BUDGETS["tiny"], 0)
+    assert 0.1 < method.notes["occupied_m2"] < 1.0  # 0.36 stands there
+    depth = method.depth(torch.tensor([[1.7, 0.0, 0.0], [0.0, -1.7, 0.0], [0.9, 0.0, 0.0]]))
+    assert torch.allclose(depth, torch.tensor([1.0, 1.0, 0.2]), atol=0.2)
+    towards, away = torch.tensor([[1.2, 0.0, math.pi]]), torch.tensor([[1.2, 0.0, 0.0]])
+    assert method.h(towards) > method.h(away)
+
+
+def test_forms_and_poses_that_are_not_known_are_refused():
+    with pytest.raises(ConfigError, match="form=speed"):
+        make("nerf_cbf", ["form=none"])
+    assert make("nerf_cbf", ["pose=estimated"]).reads == "pixels"
+    assert make("nerf_cbf").reads == "state"
+
+
+def test_the_margin_of_the_smooth_latent_has_the_slope_that_is_asked_for(systems):
+    env, _, data = systems["pendulum"]
+    torch.manual_seed(0)
+    method = make("smooth_latent", ["world_steps=2", "margin_steps=400", "steps=2", "batch=64", "slope=0.5"])
+    method.fit(data, env, BUDGETS["tiny"], 0)
+    z = method.encoder(data.pixels).detach().requires_grad_()
+    (slope,) = torch.autograd.grad(method.margin(z).sum(), z)
+    assert slope.norm(dim=-1).median() == pytest.approx(0.5, abs=0.2)
+
+
+def test_the_value_is_never_above_the_margin_for_long(systems):
+    env, _, data = systems["pendulum"]
+    torch.manual_seed(0)
+    method = make("latent_safe", ["world_steps=20", "margin_steps=200", "steps=300", "batch=64"])
+    method.fit(data, env, BUDGETS["tiny"], 0)
+    z = method.encoder(data.pixels).detach()
+    over = (method.value(z).amax(1) - method.margin(z).tanh()[:, 0]).clamp_min(0)
+    assert over.mean() < 0.1
+
+
+def test_layers_of_the_autoencoder_are_bounded_and_the_dynamics_are_affine():
+    net = BoundedAutoencoder(8, 4.0)
+    for _ in range(50):  # power iterations
+        net(torch.zeros(1, 6, 32, 32, dtype=torch.uint8))
+    weight = net.encoder[-1].weight
+    assert torch.linalg.matrix_norm(weight, 2) <= 1.01
+    step, z = ControlAffine(4, 1, 0.05, 10.0), torch.randn(3, 4)
+    at = [step(z, torch.full((3, 1), u)) for u in (-10.0, 0.0, 10.0)]
+    assert torch.allclose(at[2] - at[1], at[1] - at[0], atol=1e-6)
+
+
+def test_the_quadratic_barrier_falls_from_the_origin():
+    net = QuadraticBarrier(torch.tensor([1.0, 2.0]))
+    x = torch.randn(50, 2)
+    assert (net(x) <= net(torch.zeros(1, 2))).all()
+
+
+def test_the_nearest_admissible_action_is_taken_and_the_best_where_there_is_none():
+    tried = torch.tensor([-1.0, 0.0, 1.0])[None, :, None].expand(3, 3, 1)
+    value = torch.tensor([[0.0, 0.0, 0.0], [-1.0, 1.0, -2.0], [3.0, 2.0, 1.0]])
+    wanted = torch.tensor([[0.2], [-0.1], [0.0]])
+    action, none = nearest_admissible(tried, value, torch.zeros(3), wanted)
+    assert action.flatten().tolist() == [0.0, -1.0, 1.0]
+    assert none.tolist() == [False, False, True]
+    with pytest.raises(ShapeError, match=r"expected \(n, k, m\)"):
+        nearest_admissible(tried, value[:2], torch.zeros(3), wanted)

@@ -1,0 +1,87 @@
+"""The table: which cells, what stands in it, what is not measured again."""
+
+from __future__ import annotations
+
+import pytest
+
+from torchrl_sspl.baselines.__main__ import main
+from torchrl_sspl.baselines.cell import ROW_FILE
+from torchrl_sspl.baselines.registry import METHODS, kind_of
+from torchrl_sspl.baselines.table import DEFAULTS, TICKS, cells, markdown, table
+from torchrl_sspl.errors import ConfigError
+
+SMALL = ["score.episodes=10", "score.horizon=5", "score.grid=21", "score.kernel_grid=31", "score.frames=2"]
+
+
+def test_the_default_table_has_every_method_on_every_system():
+    asked = cells(["budget=small,full", "seed=0,1,2"])
+    for env, names in DEFAULTS.items():
+        learnt = {c.method for c in asked if c.env == env and kind_of(c.method).learns}
+        assert learnt == {name for name in METHODS if kind_of(name).learns}
+        assert {c.method for c in asked if c.env == env} == {n.split(":")[0] for n in names}
+    one = [c for c in asked if c.env == "dubins" and c.method == "latent_cbf"]
+    assert {(c.budget, c.seed) for c in one} == {(b, s) for b in ("small", "full") for s in (0, 1, 2)}
+    assert len([c for c in asked if c.env == "dubins" and c.method == "cone"]) == 1  # no budget and no seed
+    assert set(TICKS) <= set(METHODS)
+    assert {len(t) for t in TICKS.values()} == {6}
+
+
+def test_options_of_a_method_may_hold_commas():
+    found = cells(["methods=depth:noise=[0.1,0.2]:beta=0.5,lqr", "env=pendulum"])
+    assert [(c.method, c.options) for c in found] == [("depth", ("noise=[0.1,0.2]", "beta=0.5")), ("lqr", ())]
+
+
+def test_the_table_runs_what_is_missing_and_only_that(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["methods=lqr,cone", "env=pendulum", *SMALL]
+    text = table(["run=false", *words])
+    assert text.count("not measured") == 2
+    assert main(["table", *words]) == 0
+    text = capsys.readouterr().out
+    assert "| lqr | none |" in text
+    assert "expected a DubinsEnv" in text  # a cell that fails is named, the other stands
+    path = tmp_path / "runs/baselines/pendulum/none/lqr/0" / ROW_FILE
+    before = path.stat().st_mtime_ns
+    assert "not measured" in table(["run=false", *words])
+    assert main(["table", *words]) == 0
+    assert path.stat().st_mtime_ns == before
+    assert (tmp_path / "runs/baselines/table.md").is_file()
+    assert "not measured" not in table(["run=false", "methods=lqr", "env=pendulum"])  # measured with other sizes, and said so
+
+
+def test_several_seeds_are_a_mean_and_the_worst():
+    def row(value):
+        names = ["claimed_over_kernel", "false_safe", "latency_p50", "latency_p99"]
+        return {
+            "cell": {"method": "latent_cbf"}, "minutes": {"fit_cpu": 2.0},
+            "needs": dict.fromkeys(
+                ["transitions", "safe_labels", "unsafe_labels", "states", "masks", "expert_actions", "state_at_run_time", "dynamics", "proved"], 0
+            ) | {"proved": "nothing"},
+            "measurements": {n: {"value": value} for n in names},
+        }  # fmt: skip
+
+    asked = cells(["methods=latent_cbf", "env=pendulum", "seed=0,1"])
+    text = markdown(list(zip(asked, [row(0.5), row(0.7)], strict=True)))
+    assert "60.0 % (50.0 %) | 60.0 % (70.0 %)" in text
+    assert "✗ ✗ ✗ ✗ ✓ ✗" in text
+
+
+def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():
+    asked = cells(["methods=sspl:agent=pendulum,sspl", "env=pendulum"])
+    text = markdown([(cell, "not measured") for cell in asked])
+    assert "| sspl agent=pendulum | its own |" in text
+    assert "| sspl | small |" in text
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["env=cmu"], "expected env among pendulum, dubins"),
+        (["method=lqr"], "expected methods="),
+        (["methods=none"], "expected a method"),
+        (["methods=latent_cbf", "budget=large"], "expected budget"),
+    ],
+)
+def test_words_that_are_not_valid_are_refused(words, message):
+    with pytest.raises(ConfigError, match=message):
+        cells(words)

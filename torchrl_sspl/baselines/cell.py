@@ -1,0 +1,193 @@
+"""One cell of the table: a method, a task, a budget and a seed; fitted, scored, and written as one JSON."""
+
+from __future__ import annotations
+
+import functools
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from torchrl_sspl.baselines.base import BUDGETS
+from torchrl_sspl.baselines.data import Recording, record
+from torchrl_sspl.baselines.registry import kind_of, make
+from torchrl_sspl.baselines.score import ScoreConfig, score, sizes_of
+from torchrl_sspl.configs.reader import EnvFactory, compose, parse
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import ConfigError, OutputError
+from torchrl_sspl.files import RunDirectory, write
+from torchrl_sspl.seeds import spawn
+from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
+
+ROW_FILE = "row.json"
+SCHEMA = 1
+_OWN = ("env", "budget", "seed", "out_dir")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What determines a row.
+
+    Attributes:
+        method: name in ``METHODS``.
+        env: name of a system of this library, such as ``"pendulum"`` or ``"dubins"``.
+        budget: name in ``BUDGETS``.
+        seed: of data, weights and batches.
+        options: ``key=value`` changes of the method's configuration.
+        score: sizes of the measurements.
+        out_dir: where the row is written.
+
+    Source: none.
+    """
+
+    method: str
+    env: str = "pendulum"
+    budget: str = "small"
+    seed: int = 0
+    options: tuple[str, ...] = ()
+    score: ScoreConfig = field(default_factory=ScoreConfig)
+    out_dir: str = ""
+
+    @classmethod
+    def of(cls, method: str, words: Sequence[str] = ()) -> Cell:
+        """A cell of ``key=value`` words; those that are none of the cell's and not ``score.*`` are the method's.
+
+        Raises ConfigError for a word, a method, a budget or a value that is not valid.
+
+        Example:
+            >>> cell = Cell.of("hocbf", ["env=pendulum", "k=2.0", "score.episodes=10"])
+            >>> cell.options, cell.score.episodes, cell.directory.as_posix()
+            (('k=2.0',), 10, 'runs/baselines/pendulum/none/hocbf-k-2.0/0')
+        """
+        given = parse(list(words))
+        scores = [f"{k.partition('.')[2]}={v}" for k, v in given.items() if k.startswith("score.")]
+        own = {k: v for k, v in given.items() if k in _OWN}
+        options = tuple(f"{k}={v}" for k, v in given.items() if k not in _OWN and not k.startswith("score."))
+        kind = kind_of(method)
+        make(method, options)  # an option that is not valid is named before anything is done
+        if own.get("budget", "small") not in BUDGETS:
+            raise ConfigError(f"expected budget to be one of {', '.join(BUDGETS)}, received '{own['budget']}'")
+        if not own.get("seed", "0").isdigit():
+            raise ConfigError(f"expected seed to be an integer >= 0, received '{own['seed']}'")
+        try:
+            sizes: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ScoreConfig), OmegaConf.from_dotlist(scores)))
+        except OmegaConfBaseException as error:
+            valid = ", ".join(OmegaConf.structured(ScoreConfig))
+            raise ConfigError(f"expected score.* among {valid}, received {scores} ({' '.join(str(error).split())})") from error
+        budget = own.get("budget", "small") if kind.learns else "none"
+        return cls(method, own.get("env", "pendulum"), budget, int(own.get("seed", 0)), options, sizes, own.get("out_dir", ""))
+
+    @property
+    def directory(self) -> Path:
+        """Where the row lies: ``out_dir``, or one that names what determines it."""
+        name = "-".join([self.method, *(o.replace("=", "-").replace("/", "_") for o in self.options)])
+        return Path(self.out_dir or f"runs/baselines/{self.env}/{self.budget}/{name}/{self.seed}")
+
+    def describe(self) -> dict[str, Any]:
+        """Plain values that determine the row; where it lies is not among them."""
+        body = asdict(self)
+        body.pop("out_dir")
+        return body | {"options": list(self.options)}
+
+    def environment(self) -> SafetyEnv:
+        """The system; a ConfigError if there is none of that name, or its dynamics are not known."""
+        env = EnvFactory(compose([f"env={self.env}"]).env)(batch_size=[256], seed=self.seed)
+        if not isinstance(env, SafetyEnv) or env.known_twin() is not env:
+            raise ConfigError(f"env: expected a system whose true kernel is known, such as pendulum or dubins, received '{self.env}'")
+        return env
+
+
+def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
+    """The row of a cell, if it has been written; OutputError if the directory holds another one.
+
+    With ``any_score`` the sizes of its measurement do not matter. Source: none.
+
+    Example:
+        >>> stored(Cell.of("lqr", ["out_dir=runs/nowhere"])) is None
+        True
+    """
+    path = cell.directory / ROW_FILE
+    if not path.is_file():
+        return None
+    try:
+        row = json.loads(path.read_text())
+    except ValueError as error:
+        raise OutputError(f"expected a row in '{path}', received what cannot be read: {error}; remove it") from error
+    found = row.get("cell") or {}
+    if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
+        raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; choose another out_dir")
+    return row
+
+
+@functools.lru_cache(maxsize=1)
+def _recorded(env: str, budget: str, seed: int) -> Recording:
+    """One recording serves all methods of a system, a budget and a seed."""
+    return record(Cell("kernel", env, seed=seed).environment(), BUDGETS[budget], seed)
+
+
+@functools.lru_cache(maxsize=2)
+def _kernel(env: str, nodes: int) -> ViabilityKernel:
+    """One true kernel serves all methods of a system."""
+    made = Cell("kernel", env).environment()
+    return viability_kernel(made, resolution=sizes_of(made.system.kernel_grid, nodes))
+
+
+def run_cell(cell: Cell) -> dict[str, Any]:
+    """Record, fit, score, write; or read what an earlier call has written.
+
+    Returns the row: ``cell``, ``needs``, ``minutes`` (``data``, ``fit`` of wall clock, ``fit_cpu`` of the processor, ``score``) and
+    ``measurements``. Raises ConfigError for a cell that is not valid, OutputError if another row lies there or another
+    process is writing it. Source: none.
+
+    Example:
+        >>> row = run_cell(Cell.of("lqr", ["score.episodes=20", "score.grid=21", "score.kernel_grid=41", "score.frames=2"]))
+        >>> row["measurements"]["false_safe"]["value"]
+        0.0
+    """
+    with RunDirectory(cell.directory).held() as directory:
+        if (row := stored(cell)) is not None:
+            return row
+        from torchrl_sspl import __version__
+
+        env, method, budget = cell.environment(), make(cell.method, cell.options), BUDGETS.get(cell.budget)
+        method.directory = directory
+        clock = [time.perf_counter()]
+        data = _recorded(cell.env, cell.budget, cell.seed) if budget is not None and method.learns and method.records else None
+        clock.append(time.perf_counter())
+        used = time.process_time()
+        with torch.random.fork_rng():
+            torch.manual_seed(spawn(cell.seed, "weights"))
+            method.fit(data, env, budget or BUDGETS["tiny"], cell.seed)
+        used = time.process_time() - used
+        clock.append(time.perf_counter())
+        found = score(method, env, cell.score, kernel=_kernel(cell.env, cell.score.kernel_grid))
+        clock.append(time.perf_counter())
+        minutes = {name: (b - a) / 60 for name, a, b in zip(("data", "fit", "score"), clock, clock[1:], strict=False)}
+        row = {
+            "schema": SCHEMA, "version": __version__, "cell": cell.describe(), "needs": asdict(method.needs),
+            "minutes": minutes | {"fit_cpu": used / 60}, "measurements": found.to_dict(), "notes": method.notes,
+        }  # fmt: skip
+        write(directory / ROW_FILE, json.dumps(row, indent=1) + "\n")
+        return row
+
+
+def text(row: dict[str, Any]) -> str:
+    """A row for people: what was measured, with bounds, and what was needed. Source: none."""
+    cell = row["cell"]
+    lines = [f"{cell['method']} on {cell['env']}, budget {cell['budget']}, seed {cell['seed']} {' '.join(cell['options'])}".rstrip()]
+    for name, m in row["measurements"].items():
+        value = "not measured" if m["value"] is None else f"{100 * m['value']:.2f} %" if m["unit"] == "share" else f"{m['value']:.4g} {m['unit']}"
+        bounds = "" if m["lower"] is None or m["upper"] is None else f"  [{100 * m['lower']:.2f}, {100 * m['upper']:.2f}] of {m['n']}"
+        lines.append(f"  {name:<34} {value}{bounds}")
+    lines += [f"  needs {name:<28} {value}" for name, value in row["needs"].items() if value not in (0, False, "nothing", "none")]
+    lines.append("  minutes " + ", ".join(f"{name} {value:.1f}" for name, value in row["minutes"].items()))
+    return "\n".join(lines)
+
+
+__all__ = ["Cell", "run_cell", "stored", "text"]

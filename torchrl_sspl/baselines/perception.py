@@ -1,0 +1,163 @@
+"""Networks that several methods share: this library's own encoder, trained to tell the state or whatever else it is asked for."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from torchrl_sspl.baselines.data import POOL, Recording, pooled
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.dubins import DubinsEnv
+from torchrl_sspl.envs.pendulum import PixelPendulumEnv
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.modules import FrameEncoder, MomentEncoder
+from torchrl_sspl.seeds import spawn
+from torchrl_sspl.trainers.phases import InnerLoop
+
+_REACH = 0.9  # of the encoder's range (-1, 1) that states use
+
+
+class Coordinates:
+    r"""States as numbers in (-1, 1) that a network can tell, and back.
+
+    .. math:: (\cos\theta, \sin\theta, \dot\theta / 3.5) \quad\text{and}\quad (x / 2, y / 2, \cos\theta, \sin\theta)
+
+    times 0.9, for the pendulum and for the car with their own bounds. Raises ConfigError for another system. Source: none.
+
+    Args:
+        env: the system.
+
+    Example:
+        >>> at = Coordinates(PixelPendulumEnv())
+        >>> at.state(at.features(torch.tensor([[0.5, -1.0]])))
+        tensor([[ 0.5000, -1.0000]])
+    """
+
+    def __init__(self, env: SafetyEnv) -> None:
+        if not isinstance(env, PixelPendulumEnv | DubinsEnv) or env.state_dim > 3:
+            raise ConfigError(f"expected a pendulum or a Dubins car without a yaw lag, received {type(env).__name__}")
+        self.pendulum = isinstance(env, PixelPendulumEnv)
+        self.high = env.state_space.high  # type: ignore[attr-defined]
+        self.size = 3 if self.pendulum else 4
+
+    def features(self, state: Tensor) -> Tensor:
+        """``(n, s) -> (n, size)``."""
+        if self.pendulum:
+            parts = [state[:, 0].cos(), state[:, 0].sin(), state[:, 1] / self.high[1]]
+        else:
+            parts = [state[:, 0] / self.high[0], state[:, 1] / self.high[1], state[:, 2].cos(), state[:, 2].sin()]
+        return _REACH * torch.stack(parts, -1)
+
+    def state(self, features: Tensor) -> Tensor:
+        """``(n, size) -> (n, s)``."""
+        f = features / _REACH
+        if self.pendulum:
+            return torch.stack([torch.atan2(f[:, 1], f[:, 0]), f[:, 2] * self.high[1]], -1)
+        return torch.stack([f[:, 0] * self.high[0], f[:, 1] * self.high[1], torch.atan2(f[:, 3], f[:, 2])], -1)
+
+
+def encoder_for(env: SafetyEnv, size: int, data: Recording) -> FrameEncoder:
+    """The encoder that this library recommends for the system, on pooled pictures; untrained. Source: none.
+
+    Args:
+        env: the system.
+        size: of what it gives.
+        data: pictures from which an encoder of moments takes its background.
+    """
+    if not isinstance(env, DubinsEnv):
+        return FrameEncoder(size, pool_to=POOL)
+    encoder = MomentEncoder(max(size, 4), pool_to=POOL)
+    rows = torch.arange(len(data))[:: max(1, len(data) // 2000)]
+    encoder.fit(data.frames[rows, 1])
+    return encoder
+
+
+def train(
+    seed: int, steps: int, networks: dict[nn.Module, float], loss: Callable[[Tensor], dict[str, Tensor]], n: int, batch: int = 128
+) -> InnerLoop:
+    """Trains networks on batches of n rows with this library's optimiser loop: Adam, one cycle of the learning rate.
+
+    Args:
+        seed: of the batches.
+        steps: of the optimiser.
+        networks: with the largest learning rate of each.
+        loss: rows ``(batch,)`` -> terms; those named ``loss*`` are added up.
+        n: number of rows.
+        batch: rows per step.
+
+    Returns the loop, with the last loss. Source: none.
+
+    Example:
+        >>> line, x = nn.Linear(1, 1), torch.linspace(-1, 1, 50)[:, None]
+        >>> loop = train(0, 300, {line: 0.05}, lambda rows: {"loss": (line(x[rows]) - 2 * x[rows]).square().mean()}, 50)
+        >>> loop.loss < 0.01
+        True
+    """
+    loop = InnerLoop(spawn(seed, "training"))
+    loop(steps, networks, lambda: loss(loop.pick(n, batch)))
+    return loop
+
+
+class Perception(nn.Module):
+    r"""Tells the state from two pictures; learnt from pictures that come with their state.
+
+    .. math:: L = \mathbb{E}\, \lVert E(o) - c(x) \rVert^2
+
+    with the :class:`Coordinates` c. Source: supervised regression.
+
+    Args:
+        env: the system.
+        data: what it learns from; the true states are used.
+        steps: of the optimiser.
+        seed: of the batches.
+    """
+
+    def __init__(self, env: SafetyEnv, data: Recording, steps: int, seed: int) -> None:
+        super().__init__()
+        self.at, self.wrap = Coordinates(env), env.wrap
+        self.encoder = encoder_for(env, self.at.size, data)
+        target = self.at.features(data.state)
+
+        def loss(rows: Tensor) -> dict[str, Tensor]:
+            told = self.encoder(data.frames[rows, :2].flatten(1, 2))
+            return {"loss": (told - target[rows]).square().mean()}
+
+        self.loop = train(seed, steps, {self.encoder: 3e-3}, loss, len(data))
+        self.eval()
+
+    @torch.no_grad()
+    def forward(self, pixels: Tensor) -> Tensor:
+        """States ``(n, s)`` of observations ``(n, 6, H, W)`` uint8."""
+        return self.at.state(self.encoder(pooled(pixels)))
+
+
+def perception_error(told: Tensor, state: Tensor, env: SafetyEnv) -> dict[str, float]:
+    """Median and 99 % quantile of the error of each state coordinate, its own units. Source: none.
+
+    Example:
+        >>> round(perception_error(torch.tensor([[0.1, 0.0]]), torch.zeros(1, 2), PixelPendulumEnv())["x0_q50"], 3)
+        0.1
+    """
+    off = told - state
+    turn = getattr(env.state_space, "period", torch.zeros(env.state_dim))
+    off = torch.where(turn > 0, torch.remainder(off + math.pi, 2 * math.pi) - math.pi, off).abs()
+    return {f"x{k}_q{int(100 * q)}": float(off[:, k].quantile(q)) for k in range(off.shape[1]) for q in (0.5, 0.99)}
+
+
+def mlp_of(*sizes: int, activation: Any = nn.SiLU) -> nn.Sequential:
+    """A plain network of linear layers. Source: none.
+
+    Example:
+        >>> mlp_of(2, 8, 1)(torch.zeros(3, 2)).shape
+        torch.Size([3, 1])
+    """
+    from torchrl_sspl.modules.networks import mlp
+
+    return mlp(sizes, activation)
+
+
+__all__ = ["Coordinates", "Perception", "encoder_for", "mlp_of", "perception_error", "train"]

@@ -1,0 +1,152 @@
+r"""This library's own method as a row: an agent trained by the library's own run, or one that has been trained before.
+
+``agent=pendulum`` and ``agent=quadruped`` are the shipped ones, trained with a budget of their own, which is in the ledger. Without ``agent`` the run of ``env=...`` is trained with the transitions of the budget; the small one takes one round
+without rollouts of its own, and so without the memory that the shipped pendulum has. Labels are fewer than the budget allows: of
+episodes that start in S or U some leave it. The agent's policy acts by itself; ``filter=true`` puts its safety filter behind the nominal policy.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.baselines.base import Budget, Guarded, Needs, Nominal, SafetyMethod
+from torchrl_sspl.configs.reader import compose
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.pendulum import PixelPendulumEnv
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.evaluation.controllers import AgentController, Camera
+from torchrl_sspl.experiments.run import Experiment
+from torchrl_sspl.modules.agent import Agent, agent_directory, load
+from torchrl_sspl.runtime.filter import UNPROVED_MARGIN, Shield
+
+
+@dataclass
+class SSPLConfig:
+    """Options of this library's own row."""
+
+    agent: str = ""  # shipped agent or run directory; "": train
+    filter: bool = False  # behind the nominal policy, in place of the agent's own policy
+    overrides: list[str] = field(default_factory=list)  # further key=value of the training
+
+
+class SSPL(SafetyMethod):
+    """SSPL, this library's own method: from a few labels, without states and model. Source: the paper."""
+
+    name, records = "sspl", False
+    Config: ClassVar[type | None] = SSPLConfig
+
+    def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:
+        """Load the agent, or train one with the budget; see :meth:`SafetyMethod.fit`."""
+        self.env = env
+        if self.config.agent:
+            self.agent = load(self.config.agent)
+            counted = self._told()
+        else:
+            self.agent, counted = self._train(env, budget, seed)
+        proved = "invariance in the learned latent dynamics" if self.agent.tolerated_error > 0 else "the barrier's Lipschitz constant"
+        self.needs = Needs(
+            transitions=counted.get("transitions", 0), safe_labels=counted.get("labels of S", 0),
+            unsafe_labels=counted.get("labels of U", 0), rollouts=counted.get("rollouts", 0), proved=proved,
+            measured="level and round, on held-out episodes", claimed="invariance of {B <= 0}",
+        )  # fmt: skip
+        shield = None
+        if self.config.filter:
+            shield = Shield(self.agent) if self.agent.tolerated_error > 0 else Shield(self.agent, margin=UNPROVED_MARGIN)
+        self.shield = shield
+
+    def _told(self) -> dict[str, int]:
+        """What an agent that was trained before says of its data."""
+        found = agent_directory(self.config.agent) / "evaluation.json"
+        return json.loads(found.read_text()).get("budget", {}) if found.is_file() else {}
+
+    def _train(self, env: SafetyEnv, budget: Budget, seed: int) -> tuple[Agent, dict[str, int]]:
+        if self.directory is None:
+            raise ConfigError("sspl: expected a directory for the training, received none; run it as a cell")
+        system = "pendulum" if isinstance(env, PixelPendulumEnv) else "dubins"
+        shares = [0.5 * budget.transitions, 0.5 * budget.transitions, budget.safe, budget.unsafe]
+        first = budget.total - budget.rollouts
+        batch = 1280 if system == "pendulum" else 640
+        frames = -(-first // batch) * batch
+        plan = [
+            f"env={system}", f"seed={seed}", f"out_dir={self.directory / 'run'}", "logger=none", "trainer.progress=false",
+            f"collector.starts={[round(s / sum(shares), 4) for s in shares]}", "evaluation.calibrate=true",
+        ]  # fmt: skip
+        if budget.rollouts:
+            plan += [f"trainer.total_frames={min(frames, 24320 if system == 'pendulum' else 9600)}", f"synthesis.transitions={first}"]
+        else:
+            # As many steps as the recommended settings take, over fewer batches.
+            usual = compose([f"env={system}"]).trainer
+            steps = round(usual.optim_steps_per_batch * usual.total_frames / frames)
+            plan += [
+                f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}",
+                f"synthesis.transitions={frames}", "synthesis.rounds=1", "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
+                # A memory, and what is proved of it, are learnt from rollouts.
+                "synthesis.gain=1.0", "synthesis.tolerated_error=0.0", "synthesis.cover_share=0.0",
+            ]  # fmt: skip
+        experiment = Experiment(compose([*plan, *self.config.overrides]))
+        agent = experiment.train().cpu()
+        self.notes["passed"] = float(any(check.passed for check in experiment.work.checks))
+        counted = dict(experiment.work.source.budget)
+        return agent, counted
+
+    def barrier(self, seen: Tensor) -> Tensor | None:
+        """The barrier of what is seen, without a memory."""
+        return self.agent.barrier(self.agent.encode(seen))[:, 0].detach()
+
+    def act(self, seen: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor]:
+        """The agent's action on one observation, without a memory; the loop has one, see :meth:`controller`."""
+        latent = self.agent.encode(seen)
+        none = torch.zeros(len(seen), dtype=torch.bool)
+        if self.shield is None:
+            return self.agent.policy(latent).detach(), none
+        return self.shield(latent, nominal).action.detach(), none
+
+    def controller(self, nominal: Nominal) -> Guarded:
+        """The agent in a closed loop, with the memory that belongs to it."""
+        return _Remembering(self, nominal)
+
+
+class _Driver:
+    """The nominal policy as a controller that an agent watches."""
+
+    reads, streams = "pixels", True
+
+    def __init__(self, nominal: Nominal) -> None:
+        self.nominal = nominal
+
+    def reset(self, rows: Tensor | None = None) -> None:
+        """It has no memory."""
+
+    def step(self, camera: Any, rows: Tensor | None = None) -> Any:
+        from torchrl_sspl.evaluation.controllers import Decision
+
+        return Decision(self.nominal(camera.state))
+
+
+class _Remembering(Guarded):
+    """An agent behind its observer, by itself or as a filter."""
+
+    def __init__(self, method: SSPL, nominal: Nominal) -> None:
+        super().__init__(method, nominal)
+        shield = method.shield
+        if shield is None:
+            self.inner = AgentController(method.agent)
+        else:
+            self.inner = AgentController(method.agent, _Driver(nominal), lambda latent, wanted: shield(latent, wanted).action)
+
+    def reset(self, rows: Tensor | None = None) -> None:
+        """Forget what belongs to all or to some of the episodes."""
+        self.inner.reset(rows)
+
+    def decide(self, camera: Camera, rows: Tensor | None, wanted: Tensor) -> tuple[Tensor, Tensor]:
+        """The agent's actions; it has no condition that could fail."""
+        action = self.inner.step(camera, rows).action
+        return action, torch.zeros(len(action), dtype=torch.bool)
+
+
+__all__ = ["SSPL"]
