@@ -32,7 +32,8 @@ pytestmark = [
 def base() -> type[Any]:
     """Their class; what lies where it should be is a mistake, not a reason to skip."""
     spec = importlib.util.spec_from_file_location("torchrl_objectives_common", FILE)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module.LossModuleTestBase
@@ -63,7 +64,10 @@ if FOLDER is not None:
 
     @pytest.mark.parametrize(("case", "broken"), [b[1:] for b in BREAKS if b[0] in THEIRS], ids=lambda part: getattr(part, "name", None))
     def test_their_checks_notice_a_broken_copy(case: Case, broken: type) -> None:
-        theirs = type("Theirs", (base(),), {"test_reset_parameters_recursive": None})()
+        class Theirs(base()):  # type: ignore[misc]
+            def test_reset_parameters_recursive(self) -> None:
+                self.tensordict_keys_test(case.build(broken), defaults(case))
+                self.reset_parameters_recursive_test(case.build(broken))
+
         with pytest.raises((AssertionError, pytest.fail.Exception)):
-            theirs.tensordict_keys_test(case.build(broken), defaults(case))
-            theirs.reset_parameters_recursive_test(case.build(broken))
+            Theirs().test_reset_parameters_recursive()
