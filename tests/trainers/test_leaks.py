@@ -63,26 +63,30 @@ def named(mark: str) -> list[int]:
     return found
 
 
-def worked(processes: list[int]) -> list[str]:
-    """Time that processes have had on a processor; it stands still where all of them wait."""
-    found = []
+def worked(processes: list[int]) -> float:
+    """Seconds that processes have had on a processor, all together."""
+    ticks = 0
     for process in processes:
         with suppress(OSError):
-            found += Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11:13]
-    return found
+            ticks += sum(map(int, Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[11:13]))
+    return ticks / os.sysconf("SC_CLK_TCK")
 
 
-def ends(running: Callable[[], list[int]], patience: float = 60.0, limit: float = 1800.0) -> bool:
-    """Waits until nothing runs; False if all wait for nothing, as told by their work, not by the clock: beside other programs
-    an exit of seconds takes minutes."""
-    before, since, began = running(), time.monotonic(), time.monotonic()
-    work = worked(before)
-    while before:
+def ends(running: Callable[[], list[int]], patience: float = 60.0, least: float = 0.3, limit: float = 1800.0) -> bool:
+    """Waits until nothing runs; False if all wait for nothing: that they do is told by their work, not by the clock.
+
+    Beside other programs an exit of seconds takes minutes. Who only looks from time to time whether it may go on works less than
+    ``least`` seconds in ``patience``.
+    """
+    began = since = time.monotonic()
+    names = running()
+    work = worked(names)
+    while names:
         time.sleep(0.2)
-        before, past = running(), work
-        if (work := worked(before)) != past:
-            since = time.monotonic()
-        if time.monotonic() - since > patience or time.monotonic() - began > limit:
+        now, names, past = time.monotonic(), running(), names
+        if names != past or worked(names) > work + least:
+            since, work = now, worked(names)
+        if now - since > patience or now - began > limit:
             return False
     return True
 
@@ -101,7 +105,7 @@ def test_collector_processes_and_temporary_files_are_gone_with_the_run(tmp_path,
     # What it prints goes to a file: with a pipe one would wait for whoever has it still open.
     with (tmp_path / "said").open("w") as said:
         run = subprocess.Popen([sys.executable, "-X", "faulthandler", str(script), end, *words], stdout=said, stderr=said, env=environment)
-        ended = ends(lambda: [] if run.poll() is not None else named(mark)) and ends(lambda: named(mark))
+        ended = ends(lambda: [] if run.poll() is not None else sorted(named(mark))) and ends(lambda: sorted(named(mark)))
     left = named(mark)
     for process in left:
         os.kill(process, signal.SIGABRT)  # says where it hangs
