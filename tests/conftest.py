@@ -2,10 +2,31 @@
 
 from __future__ import annotations
 
+import random
 import sys
 from collections.abc import Iterator
 
 import pytest
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--shuffle", type=int, metavar="SEED", help="run the files, and the tests of each, in a random order")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    seed = config.getoption("--shuffle")
+    if seed is None:
+        return
+    # Files stay whole, or what a file builds once would be built again for every test.
+    files: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.nodeid.partition("::")[0], []).append(item)
+    chance, parts = random.Random(seed), list(files.values())
+    chance.shuffle(parts)
+    for part in parts:
+        chance.shuffle(part)
+    items[:] = [item for part in parts for item in part]
 
 
 @pytest.fixture(autouse=True)
