@@ -207,6 +207,8 @@ class SynthesisConfig:
         "barrier).")
     leave_share: float = _option(0.00075, "largest share of the held-out episodes of a round that may leave the set; "
         "none may touch U.")
+    safe_share: float = _option(0.0, "share of the held-out pictures of S that may lie outside the set, where their noise asks for more "
+        "than can be kept; above zero the smallest change after a grid asks nothing of S.")
     cover_share: float = _option(0.0, "share of the held-out episodes to which the proof has to apply from the first step "
         "to the last; sets that reach it are preferred to all others. 0: no proof is tried before the end.")
     return_share: float = _option(0.97, "share of the held-out episodes from U that should end in the set; among sets "

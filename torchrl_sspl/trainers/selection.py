@@ -79,7 +79,8 @@ class CheckRound(Phase):
     def _proved(self, work: Workspace, held_out: _HeldOut, levels: list[float]) -> Check | None:
         """The largest set that is proved to be kept and passes, with its memory held in it, among a few levels; or None."""
         s = work.config
-        apart = [v for v in levels if not any(self._mixed(held_out, v, s.guard))]
+        most = s.safe_share * len(held_out.safe)
+        apart = [v for v in levels if (mixed := self._mixed(held_out, v, s.guard))[0] == 0 and mixed[1] <= most]
         for level in apart[::_STEP][:_TRIED]:
             agent = work.agent(level)
             agent.description["tolerated_error"] = tolerated = premise(agent)
@@ -141,7 +142,7 @@ class CheckRound(Phase):
         returned = float(((back.barrier[-1] <= level) & (back.region[-1] != UNSAFE)).float().mean())
         size = float((held_out.anywhere <= level).float().mean())
         tolerated = s.leave_share * int(inside.sum())
-        counts = (("unsafe inside", bad, 0), ("safe outside", out, 0), ("left", left, tolerated), ("touched U", touched, 0))
+        counts = (("unsafe inside", bad, 0), ("safe outside", out, s.safe_share * len(held_out.safe)), ("left", left, tolerated), ("touched U", touched, 0))
         faults = [f"{name} {found}" for name, found, most in counts if found > most]
         drift = held_out.drift[inside]
         if bool((drift > held_out.largest_innovation).any()):

@@ -56,7 +56,6 @@ _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data t
 _GRID_ROOM = 4.0  # ... that the one on a grid tolerates
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
 _WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
-_STAY = 1.0  # weight of the targets where the smallest change is sought
 _MEMORY = 9  # nodes of the grid per entry that no picture shows
 _TURNS = 24  # ... around a direction
 _SEPARATE = 2000  # steps in which U is told from the rest
@@ -444,8 +443,8 @@ class Settle(Tighten):
             terms = dict(self._loss(TensorDict(latent=latent, batch_size=[len(latent)])).items())
             terms["loss_counterexample"] = _LEAST_WEIGHT * terms["loss_counterexample"]
             drawn = [table[pick(len(table), s.batch)], worst(unsafe, s.batch // 2, False)]
-            terms |= {k: _STAY * v if k.startswith("loss") else v for k, v in target(torch.cat(drawn)).items()}
-            if len(safe):
+            terms |= dict(target(torch.cat(drawn)).items())
+            if len(safe) and not s.safe_share:
                 missed = safe_hinge(work.barrier(worst(safe, s.batch // 4, True)["latent"]), _SPARE)
                 terms["loss_safe"] = _LEAST_WEIGHT * missed.mean()
             return terms
@@ -692,7 +691,7 @@ def _unsafe_margin(work: Workspace, seen: Tensor, unsafe: Tensor) -> Callable[[T
             inner, outer = (net(seen[r[loop.pick(len(r), s.batch)]]) for r in rows)
             return {"loss_unsafe": _UNSAFE_FIRST * F.softplus(inner).mean(), "loss_rest": F.softplus(-outer).mean()}
 
-        loop(min(_SEPARATE, s.fit_steps), {net: 5e-3}, step)
+        loop(max(_SEPARATE // 10, min(_SEPARATE, s.fit_steps)), {net: 5e-3}, step)
     net.requires_grad_(False)
 
     def margin(latent: Tensor) -> Tensor:
