@@ -60,8 +60,8 @@ def rounding_bound(
             reach = before + _ARGUMENT
             slopes[number] = act.slopes(below - reach, above + reach)
             size = torch.stack([t.abs() for t in act.interval(below - reach, above + reach)]).amax(0)
-            own = act.ulps * unit * (size + sizes[step.source] + before) + act.jump + _UNDERFLOW
-            own = own if act.ulps or act.jump else torch.zeros_like(before)
+            own = unit * (act.ulps * (size + sizes[step.source] + before) + act.units) + act.jump + _UNDERFLOW
+            own = own if act.ulps or act.jump or act.units else torch.zeros_like(before)
             error = torch.stack([s.abs() for s in slopes[number]]).amax(0) * before + own
         errors.append(error * _SAFETY)
         local.append(own)

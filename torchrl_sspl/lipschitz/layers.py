@@ -49,6 +49,7 @@ class Activation:
         curvature: bound of :math:`|\sigma''|` for smooth ones, 0 for piecewise linear ones.
         minimum: place and value of the only minimum of a function that is not monotone; the value is rounded down.
         ulps: how many units of rounding, relative to argument and value, a floating-point evaluation may be off.
+        units: how many of them it may be off besides, relative to one.
         jump: what it may be off besides, for constants that are no float32 numbers and thresholds of PyTorch.
     """
 
@@ -60,6 +61,7 @@ class Activation:
     minimum: tuple[float, float] | None = None
     ulps: float = 0.0
     jump: float = 0.0
+    units: float = 0.0
 
     def interval(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """Range of the function on intervals, lower and upper ends."""
@@ -192,13 +194,13 @@ class _Sine(Activation):
 def sine() -> Activation:
     """The sine of a direction's angle; no network has it as a layer.
 
-    What a float32 evaluation may be off counts what the two numbers of a direction, kept in float32, are off their circle.
+    What a floating-point evaluation may be off counts what the two numbers of a direction are off their circle.
 
     Example:
         >>> [end.item() for end in sine().interval(torch.tensor([0.0]), torch.tensor([2.0]))]
         [0.0, 1.0]
     """
-    return _Sine("Sine", torch.sin, (-1.0, 1.0), curvature=1.0, ulps=16.0, jump=1e-6)
+    return _Sine("Sine", torch.sin, (-1.0, 1.0), curvature=1.0, ulps=16.0, units=16.0)
 
 
 def clamp(low: float = -1.0, high: float = 1.0) -> Activation:
