@@ -260,4 +260,7 @@ def test_an_agent_comes_back_as_it_was(tmp_path):
         a, b = first.step(pixels), second.step(pixels)
     torch.testing.assert_close(a.latent, b.latent)
     torch.testing.assert_close(a.latent[:, 2:4].norm(dim=1), torch.full((4,), 0.3))
+    for _ in range(200):  # nothing is seen: predictions of predictions stay on the circle
+        blind = first.step(None)
+    torch.testing.assert_close(blind.latent[:, 2:4].norm(dim=1), torch.full((4,), 0.3), rtol=1e-6, atol=0.0)
     agent.export(tmp_path / "agent.pt2", check=16)

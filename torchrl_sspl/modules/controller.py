@@ -56,10 +56,9 @@ class Memory:
     def unseen(self, n: int) -> Tensor:
         """Latents ``(n, p)`` where nothing is seen: what was expected; zeros where nothing was. Nothing is remembered."""
         if self.prior is None:
-            nothing = torch.zeros(n, self.agent.latent_dim, device=self.agent.gain.device)
-            self.prior = within(nothing, direction_of(self.agent.dynamics))
+            self.prior = torch.zeros(n, self.agent.latent_dim, device=self.agent.gain.device)
             self.begins = torch.ones(n, dtype=torch.bool, device=self.agent.gain.device)
-        return self.prior
+        return within(self.prior, direction_of(self.agent.dynamics))  # predictions of predictions drift off a circle, bit by bit
 
     def expect(self, predicted: Tensor, rows: Tensor | None = None) -> None:
         """Predictions ``(n, p)`` for the next step, of all or of some of the episodes."""

@@ -59,11 +59,12 @@ _WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
 _MEMORY = 9  # nodes of the grid per entry that no picture shows
 _TURNS = 24  # ... around a direction
 _SEPARATE = 2000  # steps in which U is told from the rest
-_UNSAFE_FIRST = 3.0  # how much more a picture of U counts there
+_UNSAFE_FIRST = 6.0  # how much more a picture of U counts there
 _SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
 _NEAR_ZERO = 0.06  # of these targets, those that a batch has as many of as of all
 _DEPTH = 0.25  # barrier value up to which the targets on a grid go
 _POOL = 8192  # counterexamples that are kept
+_STARTS = 2048  # latents from which they are climbed to
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
@@ -396,12 +397,27 @@ class Tighten(FineTune):
         z = z[work.barrier(z)[:, 0] <= 0.02]
         if not len(z):
             return z
-        after, error = work.dynamics(z, work.acting(z)), work.config.tolerated_error
-        possible = work.barrier(after)[:, 0] + work.lipschitz_bound * error + _SPARE > -0.01
-        z, after = z[possible], after[possible]
+        error = work.config.tolerated_error
+        value = work.barrier(work.dynamics(z, work.acting(z)))[:, 0]
+        z = torch.cat([z[value > -0.01 - _SPARE - work.lipschitz_bound * error], self._ascend(work, z[value.topk(min(_STARTS, len(z))).indices])])
+        after = work.dynamics(z, work.acting(z))
         value = work.barrier(after + worst_error(work.barrier, after, error))[:, 0] + _SPARE
         worst = value.topk(min(_POOL, len(value)))
         return z[worst.indices[worst.values > -0.01]]
+
+    @staticmethod
+    @torch.enable_grad()
+    def _ascend(work: Workspace, latent: Tensor, steps: int = 12) -> Tensor:
+        """Latents of the set after which the barrier is higher: samples alone miss narrow peaks."""
+        z = latent
+        for k in range(steps):
+            z = z.detach().requires_grad_()
+            here = work.barrier(z)[:, 0]
+            value = work.barrier(work.dynamics(z, work.acting(z).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
+            (slope,) = torch.autograd.grad(value.sum(), z)
+            z = within(z + 0.03 * 0.8**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
+        z = z.detach()
+        return z[work.barrier(z)[:, 0] <= 0.02]
 
 
 class Settle(Tighten):
