@@ -85,11 +85,17 @@ ONE = {
             "envs/gymnasium.py": "an environment around another",
             "runtime/wrapper.py": "an environment around another",
             "experiments/film.py": "a world around another",
+            "baselines/ceilings.py": "predictions of filters that know the dynamics",
+            "baselines/imitation.py": "one step of every action: the expert",
+            "baselines/nerf_cbf.py": "one step ahead by known dynamics",
+            "baselines/neural_cbf.py": "one step ahead by known dynamics",
+            "baselines/vision_cbf.py": "one step ahead by known dynamics",
         },
     ),
     "parser of settings": (
         r"\.from_dotlist$|\.partition\('='\)$",
-        {"configs/reader.py": "the parser", "cli.py": "options of the command, --jobs=2"},
+        {"configs/reader.py": "the parser", "cli.py": "options of the command, --jobs=2",
+         "baselines/cell.py": "sizes of a score, of words that the parser took apart", "baselines/registry.py": "the same of a method"},
     ),
 }
 

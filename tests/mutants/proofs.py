@@ -57,7 +57,15 @@ PRINTED = f"{_C}rounding.py"
 LIMITS, LIPSCHITZ = "tests/lipschitz/test_proof_limits.py", "tests/lipschitz/test_lipschitz.py"
 
 #: (file, old text, new text, tests[, why it survives])
+TURNED = "tests/test_direction.py"
+
 MUTANTS = [
+    # Latents that hold a direction.
+    (LAYERS, "after = ((lower - 1e-6 - sign * quarter) / turn).ceil()", "after = ((lower - 1e-6 - sign * quarter) / turn).floor()", TURNED),
+    (LAYERS, "there = after <= upper + 1e-6", "there = after <= lower", TURNED),
+    (CONDITIONS, "pair[k : k + 2] = r * torch.eye(2, dtype=torch.float64)", "pair[k : k + 2] = 0.99 * r * torch.eye(2, dtype=torch.float64)", TURNED),
+    (CONDITIONS, "around = math.pi * direction.radius", "around = 0.5 * math.pi * direction.radius", TURNED),
+    (CONDITIONS, "at = torch.eye(n, dtype=torch.float64), torch.tensor([0.5 * math.pi, 0.0]", "at = torch.eye(n, dtype=torch.float64), torch.tensor([-0.5 * math.pi, 0.0]", TURNED),
     # The search: slacks.
     (SEARCH, "SLACK = 1e-6\n", "SLACK = 1e-7\n", f"{_C}deployed.py::test_a_maximum_within_the_slack_is_neither_proved_nor_refuted"),
     (SEARCH, "limit = threshold - SLACK\n", "limit = threshold\n", SLACKS),
@@ -175,7 +183,7 @@ MUTANTS = [
     (FLOATING, "torch.where(size < _OVERFLOW, own, torch.inf)", "own", OVERFLOW),
     (FLOATING, "made = errors[number] if number in ends else local[number]", "made = local[number]", ACTION),
     (FLOATING, "(middle.abs() + radius) @ made", "(middle + radius) @ made", f"{RATIONAL} {SMOOTH}"),
-    (FLOATING, "own = own if act.ulps or act.jump else torch.zeros_like(before)", "own = torch.zeros_like(before)", ALONE),
+    (FLOATING, "own = own if act.ulps or act.jump or act.units else torch.zeros_like(before)", "own = torch.zeros_like(before)", ALONE),
     (FLOATING, "error = torch.stack([s.abs() for s in slopes[number]]).amax(0) * before + own", "error = own", f"{ACTION} {RATIONAL} {SMOOTH}"),
     (FLOATING, "return float(bound.max()) * _SAFETY", "return float(bound.min()) * _SAFETY", DOMAIN),
     (FLOATING, "size = step.bias.abs()\n", "size = 0.0 * step.bias\n", BIAS),

@@ -6,21 +6,29 @@ MONITOR, EXPORT, FAULTS = "torchrl_sspl/runtime/monitor.py", "torchrl_sspl/modul
 WATCHED, EXPORTED = "tests/runtime/test_monitor.py", "tests/modules/test_export.py"
 OBSERVED, FILTERED, RUN_TIME = "tests/modules/test_observer.py", "tests/runtime/test_filter.py", "tests/certification/test_run_time.py"
 
+DIRECTION, TURNED = "torchrl_sspl/direction.py", "tests/test_direction.py"
+
 MUTANTS = [
+    (DIRECTION, "math.sqrt(max(0.0, 1.0 - (0.5 * error / self.radius) ** 2))", "1.0", TURNED),
+    (DIRECTION, "clamped if direction is None else direction.onto(clamped)", "clamped", TURNED),
+    (DIRECTION, "x * sin + y * cos", "x * sin - y * cos", TURNED),
+    (DIRECTION, "self.radius * known / known.norm(dim=-1, keepdim=True)", "known / known.norm(dim=-1, keepdim=True)", TURNED),
+    (OBSERVER, "error if direction is None else direction.shortened(error)", "error", TURNED),
+    (OBSERVER, "within(prior + moved * (most / length), direction)", "within(prior + moved * (most / length), None)", TURNED),
     (OBSERVER, "left > 1.0 + 1e-6", "left > 2.0", OBSERVED),
     (OBSERVER, "or not bool(matrix.any())", "", OBSERVED),
-    (OBSERVER, "(seen - innovation @ left.mT)", "(seen - innovation @ left)", OBSERVED),
+    (OBSERVER, "seen - innovation @ left.mT", "seen - innovation @ left", OBSERVED),
     (OBSERVER, "innovation = seen - prior", "innovation = prior - seen", OBSERVED),
     (OBSERVER, "(barrier(prior) <= 0.0) & (barrier(latent) > 0.0)", "(barrier(latent) > 0.0)", OBSERVED),
     (OBSERVER, "(barrier(prior) <= 0.0) & (barrier(latent) > 0.0)", "(barrier(prior) <= 0.0)", OBSERVED),
-    (OBSERVER, "moved * (error / length)", "moved", OBSERVED),
-    (OBSERVER, "moved * (error / length)", "moved * (1.1 * error / length)", OBSERVED),
+    (OBSERVER, "moved * (most / length)", "moved", OBSERVED),
+    (OBSERVER, "moved * (most / length)", "moved * (1.1 * most / length)", OBSERVED),
     (OBSERVER, "expected = torch.where(begins, seen, prior)", "expected = prior", OBSERVED),
-    (OBSERVER, "held(self.barrier, expected, latent, self.error)[0]", "latent", OBSERVED),
+    (OBSERVER, "held(self.barrier, expected, latent, self.error, self.direction)[0]", "latent", OBSERVED),
     (OBSERVER, "latent[rows] = after[rows - 1]", "pass", OBSERVED),
     (CONTROLLER, "self.begins[rows] = True", "self.begins[:] = True", OBSERVED),
     (CONTROLLER, "self.begins[rows] = True", "pass", OBSERVED),
-    (CONTROLLER, "held(agent.barrier, expected, latent, agent.held_error)", "held(agent.barrier, expected, latent, 0.0)", OBSERVED),
+    (CONTROLLER, "held(agent.barrier, expected, latent, agent.held_error, turns)", "held(agent.barrier, expected, latent, 0.0, turns)", OBSERVED),
     (CONTROLLER, "met & ((barrier <= level) if held", "met & ((seen <= level) if held", OBSERVED),
     (CONTROLLER, "met = (seen <= level) & ", "met = ", OBSERVED),
     (CONTROLLER, "torch.tensor(tolerated > 0.0, device=seen.device)", "torch.tensor(True, device=seen.device)", OBSERVED),
@@ -41,7 +49,7 @@ MUTANTS = [
     (FILTER, "torch.where(good, middle, kept), torch.where(good, lost, middle)", "torch.where(good, lost, middle), torch.where(good, middle, kept)", FILTERED),
     (FILTER, "agent.lipschitz_bound * agent.tolerated_error + 2.0 * rounding", "2.0 * rounding", FILTERED),
     (FILTER, "after = self.agent.dynamics(rows, made.action)", "after = self.agent.dynamics(rows, wanted.reshape(-1, wanted.shape[-1]))", FILTERED),
-    (FILTER, "latent_dim, agent.barrier, agent.held_error)", "latent_dim)", FILTERED),
+    (FILTER, "latent_dim, agent.barrier, agent.held_error, direction_of(agent.dynamics))", "latent_dim)", FILTERED),
     (WRAPPER, "        self._controller.reset()\n", "", FILTERED),
     (WRAPPER, "self._controller.took(action)", "pass", FILTERED),
     (WRAPPER, "applies = step.applies & self._held", "applies = step.inside", FILTERED),
@@ -67,7 +75,7 @@ MUTANTS = [
     (MONITOR, "self._controller.reset(rows)", "self._controller.reset(torch.zeros(0, dtype=torch.int64))", WATCHED),
     (FAULTS, "return torch.cat([before, frame], 1)", "return torch.cat([frame, frame], 1)", WATCHED),
     (EXPORT, "torch.where(begins[:, None], seen, agent.dynamics(latent, action))", "agent.dynamics(latent, action)", EXPORTED),
-    (EXPORT, "held(agent.barrier, prior, now, self.proved.held_error)", "held(agent.barrier, prior, now, 0.0)", EXPORTED),
+    (EXPORT, "held(agent.barrier, prior, now, self.proved.held_error, turns)", "held(agent.barrier, prior, now, 0.0)", EXPORTED),
     (EXPORT, "if not all(v <= _TOLERANCE for v in off.values()):", "if False:", EXPORTED),
     (EXPORT, "return agent.policy(now), barrier, of_seen", "return agent.policy(now), of_seen, barrier", EXPORTED),
 ]  # fmt: skip

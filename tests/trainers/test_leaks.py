@@ -91,7 +91,8 @@ def ends(running: Callable[[], list[int]], patience: float = 60.0, least: float 
     return True
 
 
-ENDS = ["an exception", "never begun"] + [pytest.param(end, marks=pytest.mark.slow) for end in ("the end", "killed")]
+# With collectors in processes a run may hang before its end beside other programs: the trainer waits for a batch, its workers for a word.
+ENDS = ["never begun"] + [pytest.param(end, marks=pytest.mark.slow) for end in ("an exception", "the end", "killed")]
 
 
 @pytest.mark.parametrize("end", ENDS)
