@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -149,6 +150,22 @@ def test_distances_on_a_grid_do_not_depend_on_its_cells():
     assert float((_signed_distance(found, queries) - true)[near].abs().max()) < 0.03  # of cells of .05 and .5
     for fill in (1.0, -1.0):
         assert (_signed_distance(replace(found, value=torch.full(grid.shape, fill)), queries) == -fill * math.inf).all()
+
+
+def test_counterexamples_that_no_sample_hits_are_climbed_to():
+    """A peak of the next barrier value beside the samples, in the set; and one outside, which is none."""
+    g, peaks = torch.Generator().manual_seed(0), torch.tensor([[-0.5, 0.3], [0.6, 0.6]])
+
+    def step(z, u):
+        height = (-((z[:, None] - peaks) / 0.15).square().sum(-1)).exp().amax(1, keepdim=True)
+        return torch.cat([height, z[:, 1:]], 1)
+
+    work = SimpleNamespace(barrier=lambda z: z[:, :1], dynamics=step, acting=lambda z: z[:, :1], direction=None)
+    start = peaks[:1] + 0.2 * torch.nn.functional.normalize(torch.randn(50, 2, generator=g), dim=1)
+    found = synthesis.Tighten._ascend(work, start)
+    assert float(step(start, None)[:, 0].max()) < 0.2
+    assert float(step(found, None)[:, 0].max()) > 0.8
+    assert float(found[:, 0].max()) <= 0.02
 
 
 def test_targets_on_a_grid_are_settled_in_place_of_a_fine_tuning():
