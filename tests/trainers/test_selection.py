@@ -91,6 +91,14 @@ def test_faults_are_named(parts, reason):
     assert found.reason == (reason or "")
 
 
+def test_a_share_of_the_pictures_of_s_may_lie_outside_and_none_of_u_inside():
+    found = held_out(safe=values(8, usual=-0.5, one=0.01))
+    assert not check(found, safe_share=0.12).passed
+    assert check(found, safe_share=0.125).passed
+    assert check(found, safe_share=0.125).safe_outside == 1  # and is counted
+    assert not check(held_out(unsafe=values(8, usual=0.5, one=0.015)), safe_share=1.0).passed
+
+
 def test_a_share_of_the_episodes_may_leave_and_none_may_touch():
     leaving = episodes([[-0.4, -0.4, 0.1], *[[-0.4, -0.4, -0.4]] * 9])
     assert not check(held_out(episodes=leaving), leave_share=0.09).passed
