@@ -76,9 +76,19 @@ def within(latent: Tensor, direction: Direction | None) -> Tensor:
     return clamped if direction is None else direction.onto(clamped)
 
 
+def lifted(chart: Tensor, direction: Direction | None) -> Tensor:
+    """Latents of charts; where there is no direction they are their own. Source: none."""
+    return chart if direction is None else direction.lift(chart)
+
+
+def charted(latent: Tensor, direction: Direction | None) -> Tensor:
+    """Charts of latents, likewise. Source: none."""
+    return latent if direction is None else direction.chart(latent)
+
+
 def direction_of(dynamics: object) -> Direction | None:
     """The direction that the latents of dynamics hold; None where they hold none, or the module does not say."""
     return getattr(dynamics, "direction", None)
 
 
-__all__ = ["Direction", "direction_of", "within"]
+__all__ = ["Direction", "charted", "direction_of", "lifted", "within"]

@@ -18,9 +18,10 @@ from torch.nn.utils.parametrizations import spectral_norm
 
 from torchrl_sspl.baselines.base import Budget, Needs, OneStepFilter
 from torchrl_sspl.baselines.data import POOL, Recording, pooled
-from torchrl_sspl.baselines.perception import mlp_of, train
+from torchrl_sspl.baselines.perception import train
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.modules import InverseDynamics
+from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 
@@ -63,7 +64,7 @@ class ControlAffine(nn.Module):
 
     def __init__(self, latent: int, actions: int, dt: float, scale: float) -> None:
         super().__init__()
-        self.f, self.g = mlp_of(latent, 96, 96, latent), mlp_of(latent, 96, 96, latent * actions)
+        self.f, self.g = mlp((latent, 96, 96, latent), nn.SiLU), mlp((latent, 96, 96, latent * actions), nn.SiLU)
         self.dt, self.scale, self.actions = dt, scale, actions
 
     def forward(self, latent: Tensor, action: Tensor) -> Tensor:
@@ -142,7 +143,7 @@ class LatentCBF(OneStepFilter):
 
     def _learn_barrier(self, z: Tensor, region: Tensor, seed: int) -> None:
         c = self.config
-        self.barrier_net = mlp_of(c.latent, 64, 64, 1)
+        self.barrier_net = mlp((c.latent, 64, 64, 1), nn.SiLU)
         tried = torch.linspace(-self.env.max_action, self.env.max_action, c.tries)
         safe, unsafe = (region == SAFE).nonzero()[:, 0], (region == UNSAFE).nonzero()[:, 0]
 

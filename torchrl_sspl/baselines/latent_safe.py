@@ -20,9 +20,10 @@ from torch import Tensor, nn
 
 from torchrl_sspl.baselines.base import Budget, Needs, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, pooled
-from torchrl_sspl.baselines.perception import encoder_for, mlp_of, train
+from torchrl_sspl.baselines.perception import encoder_for, train
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.modules import LatentDynamics
+from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.objectives import SaLaDLoss
 from torchrl_sspl.sets import SAFE, UNSAFE
 
@@ -63,7 +64,7 @@ class LatentSafe(SafetyMethod):
         self._world(data, torch.where(failed, UNSAFE, SAFE), seed)
         with torch.no_grad():
             z = torch.cat([self.encoder(part) for part in data.pixels.split(500)])
-        self.margin = nn.Sequential(mlp_of(z.shape[1], 64, 64, 64, 1))
+        self.margin = nn.Sequential(mlp((z.shape[1], 64, 64, 64, 1), nn.SiLU))
         good, bad = (~failed).nonzero()[:, 0], failed.nonzero()[:, 0]
 
         def hinge(rows: Tensor) -> dict[str, Tensor]:
@@ -83,7 +84,7 @@ class LatentSafe(SafetyMethod):
         size = self.encoder.latent_dim
         self.dynamics = LatentDynamics(size, env.action_dim, (96, 96), env.max_action)
         salad = SaLaDLoss(
-            None, self.dynamics, mlp_of(size, 64, 64, 1), consistency="online", safety_margin=0.3, safe_coeff=0.3, unsafe_coeff=0.3,
+            None, self.dynamics, mlp((size, 64, 64, 1), nn.SiLU), consistency="online", safety_margin=0.3, safe_coeff=0.3, unsafe_coeff=0.3,
             consistency_coeff=2.0, inverse_dynamics_coeff=1.0, variance_coeff=0.5, covariance_coeff=0.5, saturation_coeff=0.3,
         )  # fmt: skip
 
@@ -107,7 +108,7 @@ class LatentSafe(SafetyMethod):
         """The value of the latents, by backups in imagination over all actions at once."""
         c, k = self.config, self.config.actions
         self.tried = torch.linspace(-self.env.max_action, self.env.max_action, k)
-        self.value = mlp_of(z.shape[1], 128, 128, k)
+        self.value = mlp((z.shape[1], 128, 128, k), nn.SiLU)
         delayed, done = copy.deepcopy(self.value), [0]
 
         def loss(rows: Tensor) -> dict[str, Tensor]:

@@ -22,11 +22,12 @@ from torch import Tensor, nn
 from torchrl_sspl.baselines.base import Budget, Needs, OneStepFilter
 from torchrl_sspl.baselines.ceilings import box_of
 from torchrl_sspl.baselines.data import POOL, Recording
-from torchrl_sspl.baselines.perception import Perception, mlp_of, perception_error, train
+from torchrl_sspl.baselines.perception import Perception, perception_error, train
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.modules.networks import mlp
 
 _TABLE = 97  # nodes of the table of distances, per side
 _RAYS = 2048  # pixels per step
@@ -47,7 +48,7 @@ class Field(nn.Module):
     def __init__(self, bands: int = 4) -> None:  # six, as published, wave between the pixels of 32 x 32
         super().__init__()
         self.bands = math.pi * 2.0 ** torch.arange(bands)
-        self.net = mlp_of(2 + 4 * bands, 64, 64, 4)
+        self.net = mlp((2 + 4 * bands, 64, 64, 4), nn.SiLU)
 
     def forward(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Colour in [0, 1], and the share of the light that is stopped."""

@@ -17,8 +17,9 @@ from torch import Tensor, nn
 
 from torchrl_sspl.baselines.base import Budget, Needs, OneStepFilter
 from torchrl_sspl.baselines.data import Recording
-from torchrl_sspl.baselines.perception import Coordinates, Perception, mlp_of, perception_error, train
+from torchrl_sspl.baselines.perception import Coordinates, Perception, perception_error, train
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 
@@ -35,7 +36,7 @@ class QuadraticBarrier(nn.Module):
     def __init__(self, scale: Tensor) -> None:
         super().__init__()
         self.size, self.scale = len(scale), scale
-        self.factor, self.level = mlp_of(self.size, 64, 64, self.size**2), nn.Parameter(torch.tensor(0.5))
+        self.factor, self.level = mlp((self.size, 64, 64, self.size**2), nn.SiLU), nn.Parameter(torch.tensor(0.5))
 
     def forward(self, state: Tensor) -> Tensor:
         """``(n, s) -> (n,)``."""
@@ -49,7 +50,7 @@ class PlainBarrier(nn.Module):
 
     def __init__(self, at: Coordinates) -> None:
         super().__init__()
-        self.at, self.net = at, mlp_of(at.size, 64, 64, 1)
+        self.at, self.net = at, mlp((at.size, 64, 64, 1), nn.SiLU)
 
     def forward(self, state: Tensor) -> Tensor:
         """``(n, s) -> (n,)``."""
@@ -90,7 +91,7 @@ class NeuralCBF(OneStepFilter):
         self.notes |= perception_error(self.eyes(data.pixels[fresh]), data.state[fresh], env)
         at = Coordinates(env)
         self.net: nn.Module = QuadraticBarrier(at.high.clone()) if at.pendulum else PlainBarrier(at)
-        control = nn.Sequential(mlp_of(at.size, 48, 48, env.action_dim), nn.Tanh())
+        control = nn.Sequential(mlp((at.size, 48, 48, env.action_dim), nn.SiLU), nn.Tanh())
         groups = [(data.region == code).nonzero()[:, 0] for code in (SAFE, UNSAFE)]
         step = c.rate * env.dt  # type: ignore[attr-defined]
 

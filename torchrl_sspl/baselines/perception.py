@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -148,16 +147,4 @@ def perception_error(told: Tensor, state: Tensor, env: SafetyEnv) -> dict[str, f
     return {f"x{k}_q{int(100 * q)}": float(off[:, k].quantile(q)) for k in range(off.shape[1]) for q in (0.5, 0.99)}
 
 
-def mlp_of(*sizes: int, activation: Any = nn.SiLU) -> nn.Sequential:
-    """A plain network of linear layers. Source: none.
-
-    Example:
-        >>> mlp_of(2, 8, 1)(torch.zeros(3, 2)).shape
-        torch.Size([3, 1])
-    """
-    from torchrl_sspl.modules.networks import mlp
-
-    return mlp(sizes, activation)
-
-
-__all__ = ["Coordinates", "Perception", "encoder_for", "mlp_of", "perception_error", "train"]
+__all__ = ["Coordinates", "Perception", "encoder_for", "perception_error", "train"]

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, Outcome, Problem, maximise
 from torchrl_sspl.certification.floating import largest_rounding, rounding_bound
 from torchrl_sspl.certification.graph import Apply, Graph
-from torchrl_sspl.direction import Direction, direction_of, within
+from torchrl_sspl.direction import Direction, direction_of, lifted, within
 from torchrl_sspl.errors import ConfigError, StructureError
 from torchrl_sspl.lipschitz import lipschitz_upper
 from torchrl_sspl.lipschitz.layers import FORMS, Activation, clamp, sine
@@ -61,7 +61,7 @@ class ClosedLoop:
 
     def latent(self, point: Tensor) -> Tensor:
         """Latents ``(*batch, p)`` of points of the domain."""
-        return point if self.direction is None else self.direction.lift(point)
+        return lifted(point, self.direction)
 
     @property
     def latent_dim(self) -> int:

@@ -24,7 +24,7 @@ from torch.nn import functional as F
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.configs.schema import SynthesisConfig
-from torchrl_sspl.direction import within
+from torchrl_sspl.direction import charted, lifted, within
 from torchrl_sspl.functional import safe_hinge
 from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.modules.observer import corrected, gain_matrix
@@ -398,9 +398,11 @@ class Tighten(FineTune):
         if not len(z):
             return z
         error = work.config.tolerated_error
-        value = work.barrier(work.dynamics(z, work.acting(z)))[:, 0]
-        z = torch.cat([z[value > -0.01 - _SPARE - work.lipschitz_bound * error], self._ascend(work, z[value.topk(min(_STARTS, len(z))).indices])])
         after = work.dynamics(z, work.acting(z))
+        value = work.barrier(after)[:, 0]
+        possible = value > -0.01 - _SPARE - work.lipschitz_bound * error
+        climbed = self._ascend(work, z[value.topk(min(_STARTS, len(z))).indices])
+        z, after = torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))])
         value = work.barrier(after + worst_error(work.barrier, after, error))[:, 0] + _SPARE
         worst = value.topk(min(_POOL, len(value)))
         return z[worst.indices[worst.values > -0.01]]
@@ -520,7 +522,7 @@ def uniform(work: Workspace, n: int, generator: torch.Generator) -> Tensor:
     z = torch.rand(n, work.latent_dim - (turns is not None), generator=generator) * 2 - 1
     if turns is not None:
         z[:, turns.first] *= math.pi * turns.radius
-        z = turns.lift(z)
+    z = lifted(z, turns)
     return z if work.seen_dim is None else remembered(work, z, generator)
 
 
@@ -646,11 +648,9 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     seen, hidden = work.seen_dim or work.latent_dim, work.latent_dim - (work.seen_dim or work.latent_dim)
     looks_unsafe, room = z[unsafe][:, :seen], max(s.guard, 1.0 / (s.grid - 1))  # at least half of a cell
     low, sizes, period = [-1.0] * seen, [s.grid] * seen, [0.0] * seen
-    lift, chart = (lambda x: x,) * 2
     if turns is not None:  # the grid is one of charts
         low, sizes, period = low[:-1], [*sizes[:-2], _TURNS], [0.0] * (seen - 1)
         low[-1], period[-1] = -math.pi * turns.radius, 2.0 * math.pi * turns.radius
-        lift, chart = turns.lift, turns.chart
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * len(low)).reshape(-1, len(low))
     if len(low) > 2:  # the ends of the axes and the corners
         signs = signs[(signs.abs().sum(1) != 2)]
@@ -659,12 +659,12 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     low, sizes, period = low + [-1.0] * hidden, sizes + [_MEMORY] * hidden, period + [0.0] * hidden
     margin = _unsafe_margin(work, z[:, :seen], unsafe) if turns is not None else lambda x: nearest_distance(x[:, :seen], looks_unsafe)
     found = viability_kernel(
-        lambda x, u: chart(work.dynamics(lift(x), u)), low=low, high=[-v for v in low], resolution=sizes, period=period, errors=errors,
-        margin=lambda x: margin(lift(x)) - room, actions=action_grid(work.action_scale, s.choices or s.actions), exit_is_safe=False,
+        lambda x, u: charted(work.dynamics(lifted(x, turns), u), turns), low=low, high=[-v for v in low], resolution=sizes, period=period, errors=errors,
+        margin=lambda x: margin(lifted(x, turns)) - room, actions=action_grid(work.action_scale, s.choices or s.actions), exit_is_safe=False,
     )  # fmt: skip
     if not bool((found.value > 0.0).any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
         found = replace(found, value=found.margin)
-    distance = _signed_distance(found, chart(queries))
+    distance = _signed_distance(found, charted(queries, turns))
     target = (_SLOPE * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
     work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
     work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
