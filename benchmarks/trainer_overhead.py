@@ -48,7 +48,7 @@ from torchrl_sspl.trainers import (
     Workspace,
 )
 from torchrl_sspl.trainers.progress import Progress
-from torchrl_sspl.trainers.synthesis import off_manifold, targets
+from torchrl_sspl.trainers.targets import off_manifold, targets
 
 CLIP = 5.0
 Update = Callable[[], Tensor]

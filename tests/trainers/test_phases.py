@@ -20,8 +20,20 @@ from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.choosing import ChoosingPolicy
-from torchrl_sspl.trainers import Check, CheckRound, InnerLoop, Phase, Phases, Workspace, synthesis, synthesis_phases
-from torchrl_sspl.trainers.synthesis import Settle, _grid_targets, _signed_distance, action_grid
+from torchrl_sspl.trainers import (
+    Check,
+    CheckRound,
+    InnerLoop,
+    Phase,
+    Phases,
+    Settle,
+    Workspace,
+    synthesis,
+    synthesis_phases,
+    targets,
+)
+from torchrl_sspl.trainers.phases import action_grid
+from torchrl_sspl.trainers.targets import _grid_targets, _signed_distance
 from torchrl_sspl.viability import ViabilityKernel, viability_kernel
 from torchrl_sspl.viability.grid import Grid
 
@@ -116,7 +128,7 @@ def test_a_policy_that_chooses_continues_bit_for_bit_too(tmp_path):
 def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_path, monkeypatch):
     """On a line the obstacle lies at |x| < 0.1, and z moves by up to 0.2."""
     asked = {}
-    monkeypatch.setattr(synthesis, "viability_kernel", lambda *a, **k: asked.update(k) or viability_kernel(*a, **k))
+    monkeypatch.setattr(targets, "viability_kernel", lambda *a, **k: asked.update(k) or viability_kernel(*a, **k))
 
     class Line(nn.Module):
         latent_dim, action_scale = 1, torch.ones(1)

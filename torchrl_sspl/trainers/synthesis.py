@@ -10,59 +10,36 @@ and policy onto the largest robust invariant set of the cloud of latents (or the
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
-from scipy.ndimage import distance_transform_edt
 from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
 from torchrl_sspl.configs.schema import SynthesisConfig
-from torchrl_sspl.direction import charted, lifted, within
+from torchrl_sspl.direction import within
 from torchrl_sspl.functional import safe_hinge
-from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.modules.observer import corrected, gain_matrix
 from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
-from torchrl_sspl.trainers.phases import InnerLoop, Phase, Workspace, action_grid
-from torchrl_sspl.viability import ViabilityKernel, viability_kernel
+from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
+from torchrl_sspl.trainers.targets import observed_errors, off_manifold, remembered, successors, targets, uniform
 from torchrl_sspl.viability.cloud import (
-    barrier_targets,
-    nearby_residuals,
-    nearest_distance,
-    normal_projectors,
     reach_times,
-    robust_invariant_set,
     safety_values,
     signed_margin,
-    value_targets,
 )
-from torchrl_sspl.viability.grid import Grid
 
-_KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
-_SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerated, the first that keeps S
-_KEPT_OF_SAFE = 0.9
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
-_ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data tolerates
-_GRID_ROOM = 4.0  # ... that the one on a grid tolerates
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
 _WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
-_MEMORY = 9  # nodes of the grid per entry that no picture shows
-_TURNS = 24  # ... around a direction
-_SEPARATE = 2000  # steps in which U is told from the rest
-_UNSAFE_FIRST = 6.0  # how much more a picture of U counts there
-_SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
-_NEAR_ZERO = 0.06  # of these targets, those that a batch has as many of as of all
-_DEPTH = 0.25  # barrier value up to which the targets on a grid go
+_NEAR_ZERO = 0.06  # of the targets on a grid, those that a batch has as many of as of all
 _POOL = 8192  # counterexamples that are kept
 _STARTS = 2048  # latents from which they are climbed to
 _UNROLLED = 24  # steps through the observer
@@ -500,250 +477,4 @@ def _pieces(continues: Tensor) -> Tensor:
     return torch.where(piece < ends[:, None], piece, -1)
 
 
-@torch.no_grad()
-def off_manifold(work: Workspace, latent: Tensor, radius: float, salt: int) -> tuple[Tensor, Tensor]:
-    """Latents moved off the data manifold along its normals, and the rows that they came from."""
-    g = torch.Generator().manual_seed(work.seed + 77_000 + salt)
-    cloud = _cloud(work, g)
-    normal = normal_projectors(latent, cloud[:20000])
-    direction = (normal @ torch.randn(*latent.shape, 1, generator=g))[..., 0]
-    length = direction.norm(dim=-1, keepdim=True)
-    moved = radius * torch.rand(len(latent), 1, generator=g)
-    points = within(latent + moved * direction / length.clamp_min(1e-6), work.direction)
-    # Where another sheet of the manifold is nearer than the one it came from, a point says nothing.
-    kept = (length[:, 0] > 1e-3) & (nearest_distance(points, cloud) > 0.85 * moved[:, 0])
-    rows = kept.nonzero()[:, 0]
-    return points[rows], rows
-
-
-def uniform(work: Workspace, n: int, generator: torch.Generator) -> Tensor:
-    """``(n, p)`` latents of the whole domain."""
-    turns = work.direction
-    z = torch.rand(n, work.latent_dim - (turns is not None), generator=generator) * 2 - 1
-    if turns is not None:
-        z[:, turns.first] *= math.pi * turns.radius
-    z = lifted(z, turns)
-    return z if work.seen_dim is None else remembered(work, z, generator)
-
-
-def remembered(work: Workspace, latent: Tensor, generator: torch.Generator) -> Tensor:
-    """Latents ``(n, p)`` with other actions in their memory: anywhere in the domain, or from what the policy chooses from.
-
-    What is chosen lies on the rim of the domain, which is never drawn uniformly.
-    """
-    seen, n = work.seen_dim or work.latent_dim, len(latent)
-    hidden = torch.rand(n, work.latent_dim - seen, generator=generator) * 2 - 1
-    if work.config.choices:
-        table = action_grid([1.0] * hidden.shape[1], work.config.choices)
-        drawn = table[torch.randint(len(table), (n,), generator=generator)]
-        hidden = torch.where(torch.rand(n, 1, generator=generator) < 0.5, drawn, hidden)
-    return torch.cat([latent[:, :seen], hidden], -1)
-
-
-def _cloud(work: Workspace, generator: torch.Generator) -> Tensor:
-    cloud = torch.cat([work.latents["latent"], work.latents["next_latent"]])
-    return cloud[torch.randperm(len(cloud), generator=generator)[:80000]]
-
-
-def observed_errors(work: Workspace, latent: Tensor, generator: torch.Generator, spread: float) -> tuple[Tensor, Tensor]:
-    """Errors of the dynamics observed near latents: a sample of them, and their principal axis."""
-    data = work.latents
-    z = data["latent"]
-    with torch.no_grad():
-        residual = data["next_latent"] - work.dynamics(z, data["action"])
-    sample = torch.randperm(len(z), generator=generator)[:30000]
-    near, axes = nearby_residuals(latent, z[sample], residual[sample], count=work.config.residuals, spread=spread)
-    if work.config.tolerated_error > 0:
-        # The direction is what was observed, the length what is to be tolerated, and room for what a network does not fit.
-        mean, ends = axes[:, :1], axes[:, 1:] - axes[:, :1]
-        length = _ROOM * work.config.tolerated_error / ends.norm(dim=-1, keepdim=True).clamp_min(1e-9)
-        axes = torch.cat([mean, mean + length * ends], dim=1)
-    return near, axes
-
-
-@torch.no_grad()
-def successors(work: Workspace, latent: Tensor, actions: Tensor) -> Tensor:
-    """``(n, k, p)`` next latents under every action of a table."""
-    k = len(actions)
-    parts = [
-        work.dynamics(part.repeat_interleave(k, 0), actions.repeat(len(part), 1)).reshape(len(part), k, -1)
-        for part in latent.split(4096)
-    ]
-    return torch.cat(parts)
-
-
-def targets(work: Workspace, number: int) -> tuple[TensorDict, TensorDict]:
-    """Latents with the targets of barrier and policy, and the latents on which the condition is asked; computed once a round."""
-    if "targets" not in work.cache:
-        s, data = work.config, work.latents
-        g = torch.Generator().manual_seed(work.seed + 88_000 + number)
-        z, region = data["latent"], data["region"]
-        if work.seen_dim is not None:  # a label is about a picture, whatever the memory holds beside it
-            z, region = torch.cat([z, remembered(work, data["seen"], g)]), torch.cat([torch.zeros_like(region), region])
-        unsafe = region[:, 0] == UNSAFE
-        zc = z[~unsafe]
-        near, axes = observed_errors(work, zc, g, s.residual_spread)
-        stray = uniform(work, 60000, g)
-        tube, _ = off_manifold(work, z, 2 * s.tube_radius, 1000 + number)
-        rim, rows = off_manifold(work, zc, 1.2 * s.tube_radius, 2000 + number)
-        queries = torch.cat([z, data["next_latent"], tube, stray])
-        if s.grid:
-            target, member, best, weight = _grid_targets(work, z, unsafe, queries)
-        elif s.teacher == "value":
-            target, member, best, weight = _value_targets(work, z, region, queries, axes)
-        else:
-            target, member, best, weight = _clearance_targets(work, z, unsafe, queries, stray, axes, g)
-        rest = len(queries) - len(z)
-        table = TensorDict(
-            latent=queries,
-            barrier_target=target[:, None],
-            inside=member[:, None],
-            action_target=torch.cat([best, torch.zeros(rest, best.shape[1])]),
-            action_weight=torch.cat([weight, torch.zeros(rest)])[:, None],
-            region=torch.cat([region, torch.zeros(rest, 1, dtype=torch.int64)]),
-            batch_size=[len(queries)],
-        )
-        asked = TensorDict(
-            latent=torch.cat([zc, rim]), residual=torch.cat([near, near[rows]]), batch_size=[len(zc) + len(rim)]
-        )
-        work.cache["targets"] = table, asked
-    return work.cache["targets"]
-
-
-def _clearance_targets(
-    work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor, stray: Tensor, errors: Tensor, generator: torch.Generator
-) -> tuple[Tensor, ...]:
-    """Signed distance to the robust invariant set; actions that keep the largest clearance, or lead back soonest."""
-    s = work.config
-    zc, actions = z[~unsafe], action_grid(work.action_scale, s.actions)
-    found = robust_invariant_set(successors(work, zc, actions), zc, z[unsafe], residuals=errors)
-    kept = found.inside
-    if not bool(kept.any()):
-        # Nothing can be kept under these errors: go on with what can be kept longest, and let the held-out
-        # checks say what it is worth.
-        kept = found.removed == found.removed.max()
-    inside = torch.zeros(len(z), dtype=torch.bool)
-    inside[(~unsafe).nonzero()[:, 0]] = kept
-    far = nearest_distance(stray, _cloud(work, generator)) > s.tube_radius
-    outer_points = torch.cat([z[~inside], stray[far]])
-    bounds = {"tube_radius": s.tube_radius, "lipschitz_bound": work.lipschitz_bound}
-    target, member = barrier_targets(queries, z[inside], outer_points, **bounds)
-    best = torch.zeros(len(z), len(work.action_scale))
-    best[inside] = torch.softmax(found.clearance[kept] / 0.01, 1) @ actions
-    outer = (~inside).nonzero()[:, 0]
-    times = reach_times(successors(work, z[outer], actions), z[outer], z[inside], known_within=_KNOWN_WITHIN)
-    best[outer] = torch.softmax(-times / 0.1, 1) @ actions
-    weight = torch.ones(len(z))
-    weight[outer] = (times.min(1).values < 100).float()
-    work.kept_share = float(found.inside.float().mean())
-    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
-    return target, member, best, weight
-
-
-@torch.no_grad()
-def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -> tuple[Tensor, ...]:
-    """Signed distance to what some action of the table keeps, whatever error is added, on a grid over the latent domain; and the
-    taught policy."""
-    s, taught, turns = work.config, work.taught or work.policy, work.direction
-    seen, hidden = work.seen_dim or work.latent_dim, work.latent_dim - (work.seen_dim or work.latent_dim)
-    looks_unsafe, room = z[unsafe][:, :seen], max(s.guard, 1.0 / (s.grid - 1))  # at least half of a cell
-    low, sizes, period = [-1.0] * seen, [s.grid] * seen, [0.0] * seen
-    if turns is not None:  # the grid is one of charts
-        low, sizes, period = low[:-1], [*sizes[:-2], _TURNS], [0.0] * (seen - 1)
-        low[-1], period[-1] = -math.pi * turns.radius, 2.0 * math.pi * turns.radius
-    signs = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * len(low)).reshape(-1, len(low))
-    if len(low) > 2:  # the ends of the axes and the corners
-        signs = signs[(signs.abs().sum(1) != 2)]
-    length = signs.norm(dim=1, keepdim=True).clamp_min(1.0)
-    errors = F.pad(_GRID_ROOM * s.tolerated_error * signs / length, (0, hidden))
-    low, sizes, period = low + [-1.0] * hidden, sizes + [_MEMORY] * hidden, period + [0.0] * hidden
-    margin = _unsafe_margin(work, z[:, :seen], unsafe) if turns is not None else lambda x: nearest_distance(x[:, :seen], looks_unsafe)
-    found = viability_kernel(
-        lambda x, u: charted(work.dynamics(lifted(x, turns), u), turns), low=low, high=[-v for v in low], resolution=sizes, period=period, errors=errors,
-        margin=lambda x: margin(lifted(x, turns)) - room, actions=action_grid(work.action_scale, s.choices or s.actions), exit_is_safe=False,
-    )  # fmt: skip
-    if not bool((found.value > 0.0).any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
-        found = replace(found, value=found.margin)
-    distance = _signed_distance(found, charted(queries, turns))
-    target = (_SLOPE * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
-    work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
-    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
-    return target, target <= 0.0, taught(z), torch.ones(len(z))
-
-
-def _signed_distance(found: ViabilityKernel, queries: Tensor) -> Tensor:
-    """Distance of queries ``(n, d)`` to a set on a grid, ``(n,)``, negative inside: exact at the nodes of a grid twice as fine, on which
-    the values are interpolated, and interpolated between them."""
-    around = [bool(p) for p in found.grid.period]
-    fine = Grid(found.grid.low, found.grid.high, [2 * n - (not p) for n, p in zip(found.grid.shape, around, strict=True)], found.grid.period)
-    inside = (found.interpolate(fine.nodes()) > 0.0).reshape(fine.shape).numpy()
-    if inside.all() or not inside.any():
-        return torch.full((len(queries),), -math.inf if inside.all() else math.inf)
-    half = 0.5 * fine.step[0]  # the border lies between two nodes
-    wide = [(n // 4, n // 4) if p else (0, 0) for n, p in zip(fine.shape, around, strict=True)]  # what lies behind the seam
-    inside = np.pad(inside, wide, mode="wrap")
-    outer, inner = (distance_transform_edt(part, sampling=fine.step) for part in (~inside, inside))
-    distance = np.where(inside, half - inner, outer - half)
-    distance = distance[tuple(slice(a, d - b) for (a, b), d in zip(wide, distance.shape, strict=True))]
-    index, part, _ = fine.locate(queries)
-    return fine.gather(fine.pad(torch.from_numpy(distance.copy()).float()), index, part)
-
-
-@torch.enable_grad()
-def _unsafe_margin(work: Workspace, seen: Tensor, unsafe: Tensor) -> Callable[[Tensor], Tensor]:
-    """Distance to what looks unsafe, roughly, as a function of latents: a small network that tells pictures of U from others.
-
-    In three dimensions and more, samples lie too far apart for the distance to the nearest of them.
-    """
-    s = work.config
-    near = ~unsafe & (nearest_distance(seen, seen[unsafe]) < _DEPTH)
-    rows = [part.nonzero()[:, 0] for part in (unsafe, near if bool(near.any()) else ~unsafe)]
-    loop = InnerLoop(work.seed + 66_000)
-    with torch.random.fork_rng():
-        torch.manual_seed(work.seed + 66_001)
-        net = mlp((seen.shape[1], 64, 64, 1), nn.SiLU)
-
-        def step() -> dict[str, Tensor]:
-            inner, outer = (net(seen[r[loop.pick(len(r), s.batch)]]) for r in rows)
-            return {"loss_unsafe": _UNSAFE_FIRST * F.softplus(inner).mean(), "loss_rest": F.softplus(-outer).mean()}
-
-        loop(max(_SEPARATE // 10, min(_SEPARATE, s.fit_steps)), {net: 5e-3}, step)
-    net.requires_grad_(False)
-
-    def margin(latent: Tensor) -> Tensor:
-        with torch.enable_grad():
-            z = latent[:, : seen.shape[1]].detach().requires_grad_()
-            value = net(z)[:, 0]
-            (slope,) = torch.autograd.grad(value.sum(), z)
-        return (value / slope.norm(dim=1).clamp_min(1e-3)).detach().clamp(-1.0, 1.0)
-
-    return margin
-
-
-@torch.no_grad()
-def _value_targets(work: Workspace, z: Tensor, region: Tensor, queries: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
-    """Minus the margin that the taught policy keeps, or the best of the actions to choose from; and the taught policy itself."""
-    s, taught = work.config, work.taught or work.policy
-    unsafe, safe = region[:, 0] == UNSAFE, region[:, 0] == SAFE
-    action = taught(z)
-    margin = signed_margin(z, unsafe)
-    following, mean = work.dynamics(z, action)[:, None], errors[:, :1]
-    if s.choices:
-        following = successors(work, z, action_grid(work.action_scale, s.choices))
-    for share in _SPREADS:
-        # What looks unsafe ends there, whatever follows: no errors are needed for it.
-        around = torch.zeros(len(z), *errors.shape[1:])
-        around[~unsafe] = torch.lerp(mean, errors, share)
-        value = safety_values(following, z, margin, residuals=around).amax(1).minimum(margin)
-        # A set without S is worth nothing: rather tolerate less.
-        if int((value[safe] > 0).sum()) >= _KEPT_OF_SAFE * int(safe.sum()):
-            break
-    target = value_targets(queries, z, value, tube_radius=s.tube_radius, lipschitz_bound=work.lipschitz_bound)
-    work.kept_share = float((value[~unsafe] > 0).float().mean())
-    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "spread": share * s.residual_spread})
-    return target, target <= 0, action, torch.ones(len(z))
-
-
-__all__ = [
-    "FineTune", "FitDynamics", "FitSets", "Gather", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "action_grid", "synthesis_phases",
-]
+__all__ = ["FineTune", "FitDynamics", "FitSets", "Gather", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "synthesis_phases"]
