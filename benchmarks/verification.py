@@ -13,8 +13,9 @@ import time
 import torch
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, Problem
-from torchrl_sspl.certification.conditions import ClosedLoop, closed_loop, decide_invariance, largest_error
+from torchrl_sspl.certification.conditions import decide_invariance, largest_error
 from torchrl_sspl.certification.graph import Graph
+from torchrl_sspl.certification.loop import ClosedLoop, closed_loop
 from torchrl_sspl.certification.propagation import interval_bounds
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.modules.agent import load

@@ -20,14 +20,10 @@ from torch import Tensor, nn
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget
 from torchrl_sspl.certification.certificate import Reason
 from torchrl_sspl.certification.conditions import (
-    ClosedLoop,
-    closed_loop,
-    closed_loop_lipschitz,
     computed_error,
     decide_domain,
     decide_invariance,
     decide_vacuity,
-    evaluation_rounding,
     find_counterexamples,
     largest_error,
     search_level,
@@ -36,6 +32,7 @@ from torchrl_sspl.certification.conditions import (
 from torchrl_sspl.certification.deployed import check_deployed
 from torchrl_sspl.certification.floating import UNITS, largest_rounding
 from torchrl_sspl.certification.layers import deterministic_layer
+from torchrl_sspl.certification.loop import ClosedLoop, closed_loop, closed_loop_lipschitz, evaluation_rounding
 from torchrl_sspl.certification.vnnlib import export_vnnlib
 from torchrl_sspl.errors import ConfigError, StructureError
 from torchrl_sspl.evaluation.certify import certify, premise

@@ -11,17 +11,14 @@ from torch import Tensor, nn
 import torchrl_sspl as sspl
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, maximise
 from torchrl_sspl.certification.conditions import (
-    ClosedLoop,
-    closed_loop,
-    closed_loop_lipschitz,
     decide_domain,
     decide_invariance,
     decide_vacuity,
-    evaluation_rounding,
     find_counterexamples,
     largest_error,
     search_level,
 )
+from torchrl_sspl.certification.loop import ClosedLoop, closed_loop, closed_loop_lipschitz, evaluation_rounding
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.modules import LatentDynamics, Policy
 

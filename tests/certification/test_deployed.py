@@ -14,9 +14,10 @@ from torch.nn.utils import parametrizations, parametrize
 
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Reason
-from torchrl_sspl.certification.conditions import closed_loop, decide_invariance, decide_vacuity, largest_error
+from torchrl_sspl.certification.conditions import decide_invariance, decide_vacuity, largest_error
 from torchrl_sspl.certification.deployed import check_deployed
 from torchrl_sspl.certification.layers import deterministic_layer
+from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.errors import StructureError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.lipschitz.layers import FORMS, LAYERS, ORIGINAL, Activation, known_form

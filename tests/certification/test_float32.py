@@ -13,10 +13,11 @@ from torch import Tensor, nn
 import torchrl_sspl as sspl
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Reason
-from torchrl_sspl.certification.conditions import ClosedLoop, closed_loop, computed_error, largest_error
+from torchrl_sspl.certification.conditions import computed_error, largest_error
 from torchrl_sspl.certification.floating import UNITS, largest_rounding, rounding_bound
 from torchrl_sspl.certification.graph import Affine, Graph
 from torchrl_sspl.certification.layers import deterministic_layer
+from torchrl_sspl.certification.loop import ClosedLoop, closed_loop
 from torchrl_sspl.lipschitz.layers import Abs, activation_of
 from torchrl_sspl.modules import LatentDynamics, Policy
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, Outcome, Problem, maximise
-from torchrl_sspl.certification.conditions import ClosedLoop, closed_loop
 from torchrl_sspl.certification.graph import Graph
+from torchrl_sspl.certification.loop import ClosedLoop, closed_loop
 from torchrl_sspl.modules import LatentDynamics, Policy
 
 FEW = Budget(boxes=4000, seconds=600.0)

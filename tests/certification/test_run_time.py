@@ -14,7 +14,8 @@ from forging import copied, read, statement, to, verify, write
 from safetensors.torch import load_file, save_file
 from torch import nn
 
-from torchrl_sspl.certification.conditions import closed_loop, largest_error, tolerates
+from torchrl_sspl.certification.conditions import largest_error, tolerates
+from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.evaluation.blocks import counted, holds_at
 from torchrl_sspl.evaluation.certify import Exit, certify
 from torchrl_sspl.evaluation.simulation import Episodes

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-CONDITIONS, DEPLOYED = "torchrl_sspl/certification/conditions.py", "torchrl_sspl/certification/deployed.py"
+CONDITIONS, LOOP, DEPLOYED = (f"torchrl_sspl/certification/{n}.py" for n in ("conditions", "loop", "deployed"))
 FLOATING, MODULE = "torchrl_sspl/certification/floating.py", "torchrl_sspl/modules/choosing.py"
 AGENT, OTHERS = "torchrl_sspl/modules/agent.py", "torchrl_sspl/certification/vnnlib.py"
 
@@ -26,30 +26,30 @@ TRAVELS, TWICE = f"{_M}it_travels_with_its_agent", f"{_M}a_policy_that_is_not_bo
 
 MUTANTS = [
     # What is proved.
-    (CONDITIONS, "kept = constant[0] + 3.0 * lost", "kept = constant[0] + 2.0 * lost", ROUNDED),
+    (LOOP, "kept = constant[0] + 3.0 * lost", "kept = constant[0] + 2.0 * lost", ROUNDED),
     (CONDITIONS, "(system.accepted, constant, 2.0 * lost, ", "(system.accepted, constant, lost, ", ROUNDED),
-    (CONDITIONS, "how[\"lost\"], lost = _above(lost * lipschitz), 0.0", "pass", ROUNDED),
-    (CONDITIONS, "_SHARPNESS * (lost - self.accepted)", "_SHARPNESS * (-self.accepted)", REFUSES),
-    (CONDITIONS, "_SHARPNESS * (lost - self.accepted)", "_SHARPNESS * (lost + self.accepted)", f"{OWN} {LARGEST}"),
-    (CONDITIONS, " + self.lost_by(error)\n", "\n", COUNTS),
+    (CONDITIONS, "how[\"lost\"], lost = more_than(lost * lipschitz), 0.0", "pass", ROUNDED),
+    (LOOP, "_SHARPNESS * (lost - self.accepted)", "_SHARPNESS * (-self.accepted)", REFUSES),
+    (LOOP, "_SHARPNESS * (lost - self.accepted)", "_SHARPNESS * (lost + self.accepted)", f"{OWN} {LARGEST}"),
+    (LOOP, " + self.lost_by(error)\n", "\n", COUNTS),
     (CONDITIONS, "lost, system.lost_by(error)))", "lost))", COUNTS),
     (CONDITIONS, "upper=max(found.upper, own)", "upper=found.upper", LARGEST),
     (CONDITIONS, "upper=max(found.upper, own)", "upper=min(found.upper, own)", LARGEST),
     (CONDITIONS, "or own <= threshold\n", "or True\n", COUNTS),
     (CONDITIONS, "most = max(found.lower, system.accepted - level)", "most = found.lower", LARGEST),
-    (CONDITIONS, "accepted = -float(cast(Tensor, policy.margin))", "accepted = float(cast(Tensor, policy.margin))", LARGEST),
-    (CONDITIONS, "if any(weight) or len(weight) > 1:", "if False:", WEIGHED),
-    (CONDITIONS, "action if scale is None else action / scale", "action", GRAPH),
-    (CONDITIONS, "looped.side_by_side([looped.network(k, barrier) for k in inner])", "looped.side_by_side([looped.network(k, barrier) for k in inner[::-1]])", GRAPH),
+    (LOOP, "accepted = -float(cast(Tensor, policy.margin))", "accepted = float(cast(Tensor, policy.margin))", LARGEST),
+    (LOOP, "if any(weight) or len(weight) > 1:", "if False:", WEIGHED),
+    (LOOP, "action if scale is None else action / scale", "action", GRAPH),
+    (LOOP, "looped.side_by_side([looped.network(k, barrier) for k in inner])", "looped.side_by_side([looped.network(k, barrier) for k in inner[::-1]])", GRAPH),
     (CONDITIONS, "constant = -level if every_way else system.lost_by(error) - level", "constant = -level", COUNTS),
     (FLOATING, "nan_to_num(nan=torch.inf).amax(1)", "nan_to_num(nan=torch.inf).amin(1)", f"{WORST} {ROUNDED}"),
     # What is refused.
-    (CONDITIONS, "or loop[0] is not dynamics", "", TWINS),
-    (CONDITIONS, " or loop[1] is not barrier", "", TWINS),
-    (CONDITIONS, "    check_module(policy)\n    loop", "    loop", TWINS),
-    (CONDITIONS, "if any(t is None for t in parts) or ", "if ", TWINS),
-    (CONDITIONS, "FORMS.get(type(dynamics)) != \"residual\" or ", "", TWINS),
-    (CONDITIONS, "(corners[1] < 1.0)", "(corners[1] < 0.0)", TWINS),
+    (LOOP, "or loop[0] is not dynamics", "", TWINS),
+    (LOOP, " or loop[1] is not barrier", "", TWINS),
+    (LOOP, "    check_module(policy)\n    loop", "    loop", TWINS),
+    (LOOP, "if any(t is None for t in parts) or ", "if ", TWINS),
+    (LOOP, "FORMS.get(type(dynamics)) != \"residual\" or ", "", TWINS),
+    (LOOP, "(corners[1] < 1.0)", "(corners[1] < 0.0)", TWINS),
     (DEPLOYED, "may[:, 0] = low[:, 0] <= system.accepted", "may[:, 0] = True", TAKEN),
     (DEPLOYED, "    may &= high[:, :1] > system.accepted\n", "", TAKEN),
     (DEPLOYED, "high[:, 1:].amin(1, keepdim=True)", "high[:, 1:].amax(1, keepdim=True)", TAKEN),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 SEARCH, SPACES = "torchrl_sspl/certification/branch_and_bound.py", "torchrl_sspl/certification/half_spaces.py"
 BOUNDS, FLOATING = "torchrl_sspl/certification/propagation.py", "torchrl_sspl/certification/floating.py"
-CONDITIONS, DEPLOYED = "torchrl_sspl/certification/conditions.py", "torchrl_sspl/certification/deployed.py"
+CONDITIONS, LOOP, DEPLOYED = (f"torchrl_sspl/certification/{n}.py" for n in ("conditions", "loop", "deployed"))
 PROOF, PRINT = "torchrl_sspl/certification/layers.py", "torchrl_sspl/certification/rounding.py"
 LAYERS, NETWORK, EXACT = (f"torchrl_sspl/lipschitz/{n}.py" for n in ("layers", "network", "exact"))
 
@@ -63,9 +63,9 @@ MUTANTS = [
     # Latents that hold a direction.
     (LAYERS, "after = ((lower - 1e-6 - sign * quarter) / turn).ceil()", "after = ((lower - 1e-6 - sign * quarter) / turn).floor()", TURNED),
     (LAYERS, "there = after <= upper + 1e-6", "there = after <= lower", TURNED),
-    (CONDITIONS, "pair[k : k + 2] = r * torch.eye(2, dtype=torch.float64)", "pair[k : k + 2] = 0.99 * r * torch.eye(2, dtype=torch.float64)", TURNED),
-    (CONDITIONS, "around = math.pi * direction.radius", "around = 0.5 * math.pi * direction.radius", TURNED),
-    (CONDITIONS, "at = torch.eye(n, dtype=torch.float64), torch.tensor([0.5 * math.pi, 0.0]", "at = torch.eye(n, dtype=torch.float64), torch.tensor([-0.5 * math.pi, 0.0]", TURNED),
+    (LOOP, "pair[k : k + 2] = r * torch.eye(2, dtype=torch.float64)", "pair[k : k + 2] = 0.99 * r * torch.eye(2, dtype=torch.float64)", TURNED),
+    (LOOP, "around = math.pi * direction.radius", "around = 0.5 * math.pi * direction.radius", TURNED),
+    (LOOP, "at = torch.eye(n, dtype=torch.float64), torch.tensor([0.5 * math.pi, 0.0]", "at = torch.eye(n, dtype=torch.float64), torch.tensor([-0.5 * math.pi, 0.0]", TURNED),
     # The search: slacks.
     (SEARCH, "SLACK = 1e-6\n", "SLACK = 1e-7\n", f"{_C}deployed.py::test_a_maximum_within_the_slack_is_neither_proved_nor_refuted"),
     (SEARCH, "limit = threshold - SLACK\n", "limit = threshold\n", SLACKS),
@@ -156,15 +156,15 @@ MUTANTS = [
     (NETWORK, "    check_module(network)\n    if type(network) in COLLAPSIBLE", "    if type(network) in COLLAPSIBLE", f"{TWINS} {LIMITS}"),
     (NETWORK, "a < low or b > high", "a < low", LIMITS),
     # The closed loop.
-    (CONDITIONS, "1.0 / cast(Tensor, own)", "cast(Tensor, own)", SCALE),
-    (CONDITIONS, "if (scale is None) != (own is None):", "if scale is not None and own is None:", SCALE),
-    (CONDITIONS, "if (scale is None) != (own is None):", "if scale is None and own is not None:", SCALE),
-    (CONDITIONS, "own is not None and not torch.equal(scale, own)", "own is not None and False", TWINS),
-    (CONDITIONS, "bool((scale >= _SCALES[0]).all() & (scale <= _SCALES[1]).all())", "bool((scale <= _SCALES[1]).all())", TWINS),
-    (CONDITIONS, "FORMS.get(type(module)) != form or ", "", TWINS),
+    (LOOP, "1.0 / cast(Tensor, own)", "cast(Tensor, own)", SCALE),
+    (LOOP, "if (scale is None) != (own is None):", "if scale is not None and own is None:", SCALE),
+    (LOOP, "if (scale is None) != (own is None):", "if scale is None and own is not None:", SCALE),
+    (LOOP, "own is not None and not torch.equal(scale, own)", "own is not None and False", TWINS),
+    (LOOP, "bool((scale >= _SCALES[0]).all() & (scale <= _SCALES[1]).all())", "bool((scale <= _SCALES[1]).all())", TWINS),
+    (LOOP, "FORMS.get(type(module)) != form or ", "", TWINS),
     (CONDITIONS, "(system.low <= below).all()", "(system.low <= 9.0).all()", CLAMPED),
     (CONDITIONS, "(system.high >= above).all()", "(system.high >= -9.0).all()", CLAMPED),
-    (CONDITIONS, "_below(-(found.upper + SLACK) / system.lipschitz_bound)", "_below(-(found.lower) / system.lipschitz_bound)", SAFE_SIDE),
+    (CONDITIONS, "less_than(-(found.upper + SLACK) / system.lipschitz_bound)", "less_than(-(found.lower) / system.lipschitz_bound)", SAFE_SIDE),
     (CONDITIONS, "(SLACK - most) / system.lipschitz_bound", "(-SLACK - found.upper) / system.lipschitz_bound", SAFE_SIDE),
     (CONDITIONS, "level=level + of_barrier + SLACK", "level=level", TAKEN_IN),
     (CONDITIONS, "lost = of_step + of_barrier / lipschitz", "lost = of_step", BOTH_ENDS),
@@ -173,7 +173,7 @@ MUTANTS = [
     (CONDITIONS, "weight=(1.0 - decay,)", "weight=(1.0 + decay,)", MARGINS),
     (CONDITIONS, "constant=(margin + decrement, margin + floor)", "constant=(margin, margin + floor)", MARGINS),
     (CONDITIONS, "found.status != \"proved\", found.witness", "True, found.witness", VACUOUS),
-    (CONDITIONS, "return (1.0 + loop", "return (loop", STILL),
+    (LOOP, "return (1.0 + loop", "return (loop", STILL),
     # Floating point.
     (FLOATING, "torch.float32: 2.0**-24", "torch.float32: 2.0**-25", UNITS),
     (FLOATING, "for w in step.weights).max()) + 1 + step.roundings", "for w in step.weights).max()) + step.roundings", TERMS),

@@ -5,8 +5,6 @@ from __future__ import annotations
 from torchrl_sspl.certification.branch_and_bound import Budget, Outcome
 from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, Statement
 from torchrl_sspl.certification.conditions import (
-    ClosedLoop,
-    closed_loop,
     decide_domain,
     decide_invariance,
     decide_vacuity,
@@ -16,6 +14,7 @@ from torchrl_sspl.certification.conditions import (
     tolerates,
 )
 from torchrl_sspl.certification.layers import deterministic_layer
+from torchrl_sspl.certification.loop import ClosedLoop, closed_loop
 from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.statistics import clopper_pearson, paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.certification.vnnlib import export_vnnlib

@@ -10,318 +10,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any, cast
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget, Outcome, Problem, maximise
-from torchrl_sspl.certification.floating import largest_rounding, rounding_bound
-from torchrl_sspl.certification.graph import Apply, Graph
-from torchrl_sspl.direction import Direction, direction_of, lifted, within
-from torchrl_sspl.errors import ConfigError, StructureError
-from torchrl_sspl.lipschitz import lipschitz_upper
-from torchrl_sspl.lipschitz.layers import FORMS, Activation, clamp, sine
-from torchrl_sspl.lipschitz.network import check_module, flat_layers
-
-_SCALES = (1e-10, 1e10)
-#: How often more it counts by how much a policy that chooses accepts its own action than by how much the set is kept: any number
-#: is sound; the larger it is, the less is lost near the border of acceptance.
-_SHARPNESS = 16.0
-
-
-@dataclass(frozen=True)
-class ClosedLoop:
-    r"""Frozen networks in the form in which bounds propagate through them; made by :func:`closed_loop`.
-
-    Attributes:
-        barrier: B, ``(n, p) -> (n, 1)``. Of latents that hold a direction, this and all below are functions of their charts
-            ``(n, p - 1)``, and the domain is that of the charts.
-        step: :math:`d(z, \pi(z))`, ``(n, p) -> (n, p)``; of a policy that chooses, for its own action and each of the table,
-            ``(n, (1 + K) p)``.
-        looped: :math:`B(d(z, \pi(z)))`, ``(n, p) -> (n, 1)``; of a policy that chooses ``(n, 1 + K)``.
-        inner: numbers of the steps of ``looped`` that hold :math:`d(z, \pi(z))`, one for each output.
-        lipschitz_bound: proved Lipschitz constant of B.
-        low: lower corner of the domain, ``(p,)`` float64.
-        high: upper corner, ``(p,)`` float64.
-        accepted: :math:`-m` of a policy that chooses: what B may be after its own action; :math:`-\infty` of any other.
-    """
-
-    barrier: Graph
-    step: Graph
-    looped: Graph
-    inner: tuple[int, ...]
-    lipschitz_bound: float
-    low: Tensor
-    high: Tensor
-    accepted: float = -math.inf
-    direction: Direction | None = None
-    behind: Graph | None = None  # B of latents, where they hold a direction
-
-    def latent(self, point: Tensor) -> Tensor:
-        """Latents ``(*batch, p)`` of points of the domain."""
-        return lifted(point, self.direction)
-
-    @property
-    def latent_dim(self) -> int:
-        """Size of the latent, or of its chart."""
-        return self.barrier.input_dim
-
-    @property
-    def chooses(self) -> bool:
-        """Whether the policy chooses."""
-        return len(self.inner) > 1
-
-    def problem(
-        self,
-        *,
-        level: float | None,
-        weight: tuple[float, ...] = (0.0,),
-        constant: tuple[float, ...] = (0.0,),
-        error: float = 0.0,
-        lost: float = 0.0,
-    ) -> Problem:
-        r"""Maximum of :math:`\min_k B(d(z, \pi(z)) + e) - b_k B(z) + c_k + \lambda` where B is at most a level, if one is given,
-        over all e up to an error that stay in the domain; :math:`\lambda` is what an evaluation of :math:`B(d(z, \pi(z)))` may be off.
-
-        Of a policy that chooses, with sharpness :math:`\sigma`, it is what is left where its own action is not accepted:
-
-        .. math:: \min \{ \sigma (B(d(z, \pi(z))) + m + \lambda), \; \min_k B(d(z, a_k)) + c + 3 \lambda + L_B \delta \}
-
-        If this is at most zero, or a number below, then so is the second part wherever the first is above zero. Which of the
-        table is chosen is decided without the error, so that the error counts by the Lipschitz constant.
-        """
-        # An infinite constant would turn the cheap tests into comparisons with infinity and NaN.
-        known = self.lipschitz_bound if math.isfinite(self.lipschitz_bound) else None
-        if self.chooses:
-            if any(weight) or len(weight) > 1:
-                raise ConfigError("expected the condition R3 of a policy that chooses, received one that weighs B(z); see decide_invariance")
-            n = len(self.inner)
-            kept = constant[0] + 3.0 * lost + self.lost_by(error)
-            constant = (_SHARPNESS * (lost - self.accepted), *[kept] * (n - 1))
-            rows, weight, error = torch.diag(torch.tensor([_SHARPNESS] + [1.0] * (n - 1), dtype=torch.float64)), (0.0,) * n, 0.0
-        else:
-            rows, constant = torch.ones(len(weight), 1, dtype=torch.float64), tuple(c + lost for c in constant)
-        b, c = (torch.tensor(v, dtype=torch.float64) for v in (weight, constant))
-        of: dict[str, Any] = {"level": level, "lipschitz": known, "inner": self.inner, "error": error, "behind": self.behind}
-        if self.direction is not None:
-            of["within"] = partial(within, direction=self.direction)
-        return Problem(self.low, self.high, self.looped, rows, self.barrier, b, c, **of)
-
-    def lost_by(self, error: float) -> float:
-        """What B may rise by with an error, latent units, by the Lipschitz constant; barrier units, rounded up."""
-        return _above(self.lipschitz_bound * error) if error else 0.0
-
-    def rounding(self, unit: float, *, boxes: int = 8192) -> tuple[float, float]:
-        """What an evaluation with a unit roundoff is off at most, anywhere: of B, and of d(z, pi(z)) (Euclidean norm)."""
-        step = largest_rounding(self.step, self.low, self.high, unit, boxes=boxes, vectors=len(self.inner))
-        return largest_rounding(self.barrier, self.low, self.high, unit, boxes=boxes), step
-
-
-def closed_loop(
-    barrier: nn.Module,
-    dynamics: nn.Module,
-    policy: nn.Module,
-    *,
-    latent_dim: int,
-    lipschitz_bound: float,
-    low: float | Tensor = -1.0,
-    high: float | Tensor = 1.0,
-) -> ClosedLoop:
-    r"""The closed loop of frozen networks.
-
-    .. math:: u = s \operatorname{clamp}(\operatorname{net}_\pi(z), -1, 1), \qquad
-        z^+ = \operatorname{clamp}(z + \operatorname{net}_d(z, u / s), -1, 1)
-
-    Modules are known by their exact types (:mod:`torchrl_sspl.lipschitz.layers`), and whatever might stand between
-    their weights and what they compute is refused.
-
-    Args:
-        barrier: ``nn.Sequential`` of linear layers and activations (or one with ``collapse()``), p inputs, 1 output.
-        dynamics: module in the form above (``modules.LatentDynamics``), or a plain ``nn.Sequential`` of ``(z, u)``,
-            p + m inputs and p outputs, taken as it is. Either takes the action in physical units.
-        policy: module in the form above (``modules.Policy``), or a plain ``nn.Sequential``, p inputs and m outputs.
-            Either gives the action in physical units. Or a ``modules.ChoosingPolicy`` of such a policy, bound to this barrier and
-            to these dynamics, which are of the form above.
-        latent_dim: p.
-        lipschitz_bound: proved Lipschitz constant of the barrier (``math.inf`` where none is known).
-        low: lower corner of the domain, a number or ``(p,)``.
-        high: upper corner.
-
-    Raises:
-        StructureError: if a module may compute something else than it says, or an action scale differs or is not valid.
-        ConfigError: if the domain is empty.
-        ShapeError: if the networks do not fit each other.
-        NonFiniteError: if a weight is NaN or infinite.
-
-    Source: paper eq. (8)-(9), composed; deviation: none.
-
-    Example:
-        >>> plant = nn.Sequential(nn.Linear(3, 2, bias=False))  # z+ = z / 2, whatever the action is
-        >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0, 0.0, 0.0, 0.5, 0.0]), plant.parameters())
-        >>> barrier, policy = nn.Sequential(nn.Linear(2, 1)), nn.Sequential(nn.Linear(2, 1))
-        >>> closed_loop(barrier, plant, policy, latent_dim=2, lipschitz_bound=math.inf).step(torch.ones(1, 2)).tolist()
-        [[0.5, 0.5]]
-    """
-    corners = [torch.as_tensor(c, dtype=torch.float64).cpu().expand(latent_dim).clone() for c in (low, high)]
-    if not bool((corners[0] < corners[1]).all()) or not all(bool(c.isfinite().all()) for c in corners):
-        raise ConfigError(f"expected finite low < high in every dimension, received {corners[0].tolist()}, {corners[1].tolist()}")
-    if not lipschitz_bound > 0:
-        raise ConfigError(f"expected a positive Lipschitz bound of the barrier, received {lipschitz_bound}")
-    chooses = FORMS.get(type(policy)) == "choosing"
-    if chooses:
-        _check_choice(policy, dynamics, barrier, corners)
-    direction = direction_of(dynamics) if FORMS.get(type(dynamics)) == "residual" else None
-    behind = Graph(latent_dim)
-    behind.network(0, barrier)
-    if direction is not None:
-        corners = _chart_of(direction, corners)
-    of_chart = latent_dim if direction is None else latent_dim - 1
-    alone, step, looped = Graph(of_chart), Graph(of_chart), Graph(of_chart)
-    alone.network(_append_latent(alone, 0, direction), barrier)
-    found, inner = (_append_steps(graph, dynamics, policy, direction) for graph in (step, looped))
-    sizes = {step.sizes[k] for k in found}
-    if alone.output_dim != 1 or sizes != {latent_dim}:
-        raise ConfigError(
-            f"expected a barrier of one output and dynamics of {latent_dim}, received {alone.output_dim} and {sorted(sizes)}"
-        )
-    step.side_by_side(found)
-    looped.side_by_side([looped.network(k, barrier) for k in inner])
-    accepted = -float(cast(Tensor, policy.margin)) if chooses else -math.inf
-    turns: dict[str, Any] = {} if direction is None else {"direction": direction, "behind": behind}
-    return ClosedLoop(alone, step, looped, tuple(inner), float(lipschitz_bound), corners[0], corners[1], accepted, **turns)
-
-
-def _chart_of(direction: Direction, corners: Sequence[Tensor]) -> list[Tensor]:
-    """Corners of the charts of the whole domain; a part of it is a ConfigError."""
-    if bool((corners[0] != -1.0).any() | (corners[1] != 1.0).any()):
-        raise ConfigError("expected the whole domain [-1, 1]^p of latents that hold a direction, received a part of it")
-    around = math.pi * direction.radius * (1.0 + 1e-12)
-    return [torch.cat([c[: direction.first], c.new_tensor([s * around]), c[direction.first + 2 :]]) for s, c in zip((-1.0, 1.0), corners, strict=True)]
-
-
-def _append_latent(graph: Graph, chart: int, direction: Direction | None, clamped: int | None = None) -> int:
-    """Appends the latent of a chart, the entries beside the direction from another step where one is given; itself where there is none."""
-    if direction is None:
-        return chart
-    n, k, r = graph.sizes[chart], direction.first, direction.radius
-    eye, at = torch.eye(n, dtype=torch.float64), torch.tensor([0.5 * math.pi, 0.0], dtype=torch.float64)
-    waves = graph.apply(graph.linear([chart], [eye[k].expand(2, n) / r], at), sine())  # cosine and sine
-    others = torch.zeros(n + 1, n, dtype=torch.float64)
-    others[:k, :k], others[k + 2 :, k + 1 :] = eye[:k, :k], eye[k + 1 :, k + 1 :]
-    pair = torch.zeros(n + 1, 2, dtype=torch.float64)
-    pair[k : k + 2] = r * torch.eye(2, dtype=torch.float64)
-    return graph.linear([chart if clamped is None else clamped, waves], [others, pair])
-
-
-def _check_choice(policy: nn.Module, dynamics: nn.Module, barrier: nn.Module, corners: Sequence[Tensor]) -> None:
-    """Refuses a policy that chooses by something else than what is proved, or in another way."""
-    check_module(policy)
-    loop = vars(policy).get("loop")
-    if type(loop) is not tuple or len(loop) != 2 or loop[0] is not dynamics or loop[1] is not barrier:
-        raise StructureError(
-            "expected a policy that chooses by the dynamics and the barrier that are proved, received one that is "
-            f"{'not bound' if loop is None else 'bound to others'}; bind(dynamics, barrier), which an Agent does by itself",
-            "CHOOSES_BY_OTHERS",
-        )
-    parts = [policy._buffers.get(name) for name in ("actions", "margin")]
-    if any(t is None for t in parts) or cast(Tensor, parts[0]).ndim != 2 or cast(Tensor, parts[1]).ndim:
-        raise StructureError("expected a policy that chooses from a table of actions (K, m) with one margin, buffers both")
-    if FORMS.get(type(dynamics)) != "residual" or bool((corners[0] > -1.0).any() | (corners[1] < 1.0).any()):
-        raise StructureError(
-            "expected dynamics of the form 'residual' (modules.LatentDynamics) in a domain that holds [-1, 1]: a policy that chooses "
-            f"asks B of every successor, received {type(dynamics).__name__} and {corners[0].tolist()}, {corners[1].tolist()}"
-        )
-
-
-def _append_steps(graph: Graph, dynamics: nn.Module, policy: nn.Module, direction: Direction | None) -> list[int]:
-    """Appends d(z, pi(z)), or what a policy that chooses compares: d(z, .) of its own action, then of those of its table."""
-    chooses = FORMS.get(type(policy)) == "choosing"
-    latent = _append_latent(graph, 0, direction)
-    own, scale = _append_policy(graph, latent, cast(nn.Module, policy.policy) if chooses else policy)
-    actions = [own]
-    for action in cast(Tensor, policy.actions).detach().double().cpu() if chooses else ():
-        if len(action) != graph.sizes[own]:
-            raise StructureError(f"expected a table of {graph.sizes[own]} entries per action, received {len(action)}")
-        # A step of its own: in the bias of the next one, terms that cancel would seem to round off nothing.
-        still = torch.zeros(len(action), graph.input_dim)
-        actions.append(graph.linear([0], [still], action if scale is None else action / scale))
-    return [_append_dynamics(graph, latent, dynamics, action, scale, direction) for action in actions]
-
-
-def _append_policy(graph: Graph, latent: int, policy: nn.Module) -> tuple[int, Tensor | None]:
-    """Appends the policy; the result times the scale (where there is one) is the action in physical units."""
-    net, scale = _taken_apart(policy, "policy", "bounded")
-    if scale is None:
-        return graph.interface(graph.layers(latent, net)), None
-    action = graph.interface(graph.apply(graph.layers(latent, net), clamp()))
-    return action, _checked_scale(scale, graph.sizes[action])
-
-
-def _append_dynamics(
-    graph: Graph, latent: int, dynamics: nn.Module, action: int, scale: Tensor | None, direction: Direction | None
-) -> int:
-    """Appends the dynamics, whose action is a step times the policy's scale."""
-    layers, own = _taken_apart(dynamics, "dynamics", "residual")
-    p, m = graph.sizes[latent], graph.sizes[action]
-    own = None if own is None else _checked_scale(own, m)
-    if scale is not None and own is not None and not torch.equal(scale, own):
-        raise StructureError(f"expected one action scale in dynamics and policy, received {scale.tolist()} and {own.tolist()}")
-    if (scale is None) != (own is None):  # each module has its own unit: what is deployed multiplies or divides
-        factor = scale if own is None else 1.0 / cast(Tensor, own)
-        action = graph.interface(graph.linear([action], [torch.diag(cast(Tensor, factor))], roundings=2))
-    if not layers or not isinstance(layers[0], nn.Linear):
-        raise StructureError(f"expected the dynamics to start with a linear layer, received {[type(x).__name__ for x in layers[:1]]}")
-    first, last = layers[0], layers[-1]
-    weights = [first.weight[:, :p], first.weight[:, p:]]
-    # Of one scale in both modules nothing is left but the rounding of a product and a quotient.
-    hidden = graph.linear([latent, action], weights, first.bias, roundings=0 if own is None else 3)
-    if own is None:
-        return graph.interface(graph.layers(hidden, layers[1:]))
-    if len(layers) == 1 or not isinstance(last, nn.Linear):
-        raise StructureError("expected the dynamics' network to start and end with different linear layers")
-    hidden = graph.layers(hidden, layers[1:-1])
-    p = graph.input_dim  # a network that turns a direction moves the chart
-    eye, rest = torch.eye(p), p - last.out_features
-    if getattr(dynamics, "remembers", False) and rest == m:  # the action of this step, divided by its scale
-        pads = [nn.functional.pad(t, (0, 0, 0, rest)) for t in (eye[:-rest], last.weight)]
-        bias = nn.functional.pad(last.bias, (0, rest)) if last.bias is not None else None
-        moved = graph.linear([0, hidden, action], [*pads, eye[:, -rest:]], bias, roundings=3)
-    else:
-        moved = graph.linear([0, hidden], [eye, last.weight], last.bias, roundings=1)
-    if direction is None:
-        return graph.interface(graph.apply(moved, clamp()))
-    moved = graph.interface(moved)
-    return graph.interface(_append_latent(graph, moved, direction, graph.apply(moved, clamp())))
-
-
-def _taken_apart(module: nn.Module, name: str, form: str) -> tuple[list[nn.Module], Tensor | None]:
-    """The layers of a part of the loop, and its action scale if it is of a form that has one."""
-    if type(module) is nn.Sequential:
-        return flat_layers(module), None
-    related = any(k in FORMS or k is nn.Sequential for k in type(module).__mro__)
-    if related:
-        check_module(module)
-    net = module._modules.get("net")
-    if not related or FORMS.get(type(module)) != form or type(net) is not nn.Sequential:
-        raise StructureError(
-            f"expected the {name} to be an nn.Sequential, or a module of the form '{form}' with an nn.Sequential 'net' "
-            f"(modules.LatentDynamics, modules.Policy, or registered by lipschitz.layers.known_form), received "
-            f"{type(module).__name__}"
-        )
-    return flat_layers(net), cast(Tensor, getattr(module, "action_scale", None))
-
-
-def _checked_scale(scale: Tensor, actions: int) -> Tensor:
-    valid = isinstance(scale, Tensor) and scale.is_floating_point() and scale.shape in ((actions,), (1,))
-    if not valid or not bool((scale >= _SCALES[0]).all() & (scale <= _SCALES[1]).all()):
-        raise StructureError(
-            f"expected {actions} positive finite action scales within {_SCALES}, where float32 loses nothing, received "
-            f"{scale}; pass the largest action, in another unit if need be",
-            "SCALE_INVALID",
-        )
-    return scale.detach().double().cpu().expand(actions)
+from torchrl_sspl.certification.floating import less_than, more_than
+from torchrl_sspl.certification.graph import Apply
+from torchrl_sspl.certification.loop import ClosedLoop
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.lipschitz.layers import Activation
 
 
 def decide_invariance(
@@ -366,6 +65,8 @@ def decide_invariance(
     Source: paper eq. (5); deviation: on the set instead of everywhere, on the whole latent domain instead of samples.
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
         >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
         >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
@@ -410,6 +111,8 @@ def largest_next(
     Source: none.
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
         >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
         >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
@@ -448,6 +151,8 @@ def largest_error(
     Source: none (the paper estimates the error and asks for the margin; here the margin is computed).
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
         >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
         >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
@@ -458,19 +163,9 @@ def largest_error(
         raise ConfigError("expected a finite Lipschitz bound of the barrier, received infinity; prove one first")
     found = largest_next(system, level=level, constant=-level, tolerance=tolerance, budget=budget, progress=progress)
     # What decides, decides by more than the slack.
-    proved = _below(-(found.upper + SLACK) / system.lipschitz_bound)
+    proved = less_than(-(found.upper + SLACK) / system.lipschitz_bound)
     most = max(found.lower, system.accepted - level)  # errors count by the Lipschitz constant where an action is accepted, too
     return LargestError(proved, (SLACK - most) / system.lipschitz_bound, found)
-
-
-def _below(value: float) -> float:
-    """Less than what the last operations, exactly carried out, would give."""
-    return value - 4.0 * math.ulp(value)
-
-
-def _above(value: float) -> float:
-    """More than what the last operations, exactly carried out, would give."""
-    return value + 4.0 * math.ulp(value)
 
 
 def tolerates(
@@ -503,6 +198,8 @@ def tolerates(
     Source: none.
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = z / 2, and B(z) = z
         >>> nn.utils.vector_to_parameters(torch.tensor([0.5, 0.0]), plant.parameters())
         >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=9.0)
@@ -562,10 +259,10 @@ def computed_error(
     if delta > 0.0:
         how: dict[str, Any] = {"tolerance": tolerance, "budget": budget}
         if system.chooses:  # what is lost decides which action is taken
-            how["lost"], lost = _above(lost * lipschitz), 0.0
+            how["lost"], lost = more_than(lost * lipschitz), 0.0
         found = largest_next(system, level=level + of_barrier + SLACK, constant=-level, **how)
         delta = -(found.upper + SLACK) / lipschitz - lost
-    return ComputedError(_below(_below(delta)), of_barrier, of_step)
+    return ComputedError(less_than(less_than(delta)), of_barrier, of_step)
 
 
 def decide_domain(system: ClosedLoop, *, budget: Budget | None = None) -> Outcome:
@@ -578,6 +275,8 @@ def decide_domain(system: ClosedLoop, *, budget: Budget | None = None) -> Outcom
     Source: none (the paper's latent space is unbounded).
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = 3 z / 2
         >>> nn.utils.vector_to_parameters(torch.tensor([1.5, 0.0]), plant.parameters())
         >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
@@ -620,6 +319,8 @@ def decide_vacuity(system: ClosedLoop, *, level: float = 0.0, budget: Budget | N
     Source: none; a barrier that is negative everywhere meets the paper's third condition without saying anything.
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant, policy = nn.Sequential(nn.Linear(2, 1)), nn.Sequential(nn.Linear(1, 1))
         >>> loop = closed_loop(nn.Identity(), plant, policy, latent_dim=1, lipschitz_bound=1.0)
         >>> decide_vacuity(loop, level=-2.0).status
@@ -660,6 +361,8 @@ def search_level(
     Source: none.
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = 2 z, and B(z) = z
         >>> nn.utils.vector_to_parameters(torch.tensor([2.0, 0.0]), plant.parameters())
         >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
@@ -674,43 +377,6 @@ def search_level(
             # Nothing is easier to keep than nothing.
             return None if decide_vacuity(system, level=level, budget=budget).status == "empty" else (level, outcome)
     return None
-
-
-def evaluation_rounding(system: ClosedLoop, *, unit: float = 2.0**-53, per_axis: int = 4) -> float:
-    r"""How far an evaluation of :math:`B(d(z, \pi(z)))` with a unit roundoff can be from the exact one, barrier units.
-
-    With the unit of float64 it has to lie far below the slack by which bounds decide. With that of float32 it is a
-    worst case that real evaluations come nowhere near. The domain is bounded in ``per_axis`` pieces per dimension.
-    """
-    corners = zip(system.low, system.high, strict=True)
-    edges = [torch.linspace(float(a), float(b), per_axis + 1, dtype=torch.float64) for a, b in corners]
-    ends = ([e[:-1] for e in edges], [e[1:] for e in edges])
-    parts = zip(*(torch.cartesian_prod(*e).reshape(-1, system.latent_dim).split(512) for e in ends), strict=True)
-    factor = _SHARPNESS if system.chooses else 1.0
-    return factor * max(float(rounding_bound(system.looped, a, b, unit)[-1].max()) for a, b in parts)
-
-
-def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
-    r"""Certified Lipschitz constant of :math:`z \mapsto d(z, \pi(z))`, the one that paper Theorem 1 leaves out.
-
-    .. math:: L_{cl} \le 1 + L_{net_d} \sqrt{1 + L_{net_\pi}^2}
-
-    Dynamics and policy are of the forms "residual" and "bounded" with one action scale, else ``StructureError``; a policy that
-    chooses has none.
-
-    Example:
-        >>> from torchrl_sspl.modules import LatentDynamics, Policy
-        >>> closed_loop_lipschitz(LatentDynamics(2, 1), Policy(2, 1)) > 1
-        True
-    """
-    if FORMS.get(type(policy)) == "choosing":
-        raise StructureError("expected a continuous policy, received one that chooses: its closed loop has no Lipschitz constant")
-    moved, scale = _taken_apart(dynamics, "dynamics", "residual")
-    control, own = _taken_apart(policy, "policy", "bounded")
-    if scale is None or own is None or not torch.equal(scale, own):
-        raise StructureError("expected modules.LatentDynamics and modules.Policy of one action scale, received others")
-    loop, gain = (float(lipschitz_upper(nn.Sequential(*layers))) for layers in (moved, control))
-    return (1.0 + loop * math.sqrt(1.0 + gain * gain)) * (1.0 + 1e-12)
 
 
 def find_counterexamples(
@@ -740,6 +406,8 @@ def find_counterexamples(
     Source: none (counterexample-guided training).
 
     Example:
+        >>> from torch import nn
+        >>> from torchrl_sspl.certification import closed_loop
         >>> plant = nn.Sequential(nn.Linear(2, 1, bias=False))  # z+ = 3 z / 2, and B(z) = z
         >>> nn.utils.vector_to_parameters(torch.tensor([1.5, 0.0]), plant.parameters())
         >>> loop = closed_loop(nn.Identity(), plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)

@@ -12,8 +12,8 @@ import itertools
 import torch
 from torch import Tensor, nn
 
-from torchrl_sspl.certification.conditions import ClosedLoop
 from torchrl_sspl.certification.floating import UNITS, rounding_bound
+from torchrl_sspl.certification.loop import ClosedLoop
 from torchrl_sspl.errors import SSPLError, StructureError
 
 POINTS = 1000
@@ -40,7 +40,7 @@ def check_deployed(
 ) -> int:
     """Compares the modules with the closed loop that was built from them, at random points, corners and the centre.
 
-    The modules are those of :func:`~.conditions.closed_loop`, with the ``collapse()`` of a barrier that has one.
+    The modules are those of :func:`~.loop.closed_loop`, with the ``collapse()`` of a barrier that has one.
     Of a policy that chooses each action's successor is compared, and which of them it takes.
     Returns the number of all points; ``StructureError`` if values differ by more than rounding allows, a module changes
     its input, or the dtypes are not one of float32 and float64.

@@ -8,6 +8,8 @@ which forgets that most units are off and that the others cancel.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -154,3 +156,13 @@ def _add(pending: dict[int, tuple[Tensor, Tensor]], key: int, middle: Tensor, ra
     if key in pending:
         middle, radius = pending[key][0] + middle, pending[key][1] + radius
     pending[key] = middle, radius
+
+
+def less_than(value: float) -> float:
+    """Less than what the last operations, exactly carried out, would give."""
+    return value - 4.0 * math.ulp(value)
+
+
+def more_than(value: float) -> float:
+    """More than what the last operations, exactly carried out, would give."""
+    return value + 4.0 * math.ulp(value)

@@ -13,19 +13,17 @@ from torch import Tensor, nn
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget
 from torchrl_sspl.certification.certificate import PROVED, Layer, Reason
 from torchrl_sspl.certification.conditions import (
-    ClosedLoop,
-    closed_loop,
     computed_error,
     decide_domain,
     decide_invariance,
     decide_vacuity,
-    evaluation_rounding,
     largest_error,
     search_level,
     tolerates,
 )
 from torchrl_sspl.certification.deployed import check_deployed, deployed_dtype
 from torchrl_sspl.certification.floating import UNITS
+from torchrl_sspl.certification.loop import ClosedLoop, closed_loop, evaluation_rounding
 from torchrl_sspl.certification.rounding import up
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError, StructureError
 from torchrl_sspl.lipschitz import prove_lipschitz
@@ -50,7 +48,7 @@ def deterministic_layer(
 
     Args:
         barrier: plain network, p inputs, 1 output.
-        dynamics: see :func:`~torchrl_sspl.certification.conditions.closed_loop`.
+        dynamics: see :func:`~torchrl_sspl.certification.loop.closed_loop`.
         policy: see there.
         latent_dim: p.
         lipschitz_bound: claimed Lipschitz constant of the barrier.
@@ -222,7 +220,7 @@ def level_that_holds(
 ) -> float:
     """The largest of several levels, barrier units, whose set is kept; the first of them if none is.
 
-    The networks are those of :func:`~torchrl_sspl.certification.conditions.closed_loop`; the levels are tried in their
+    The networks are those of :func:`~torchrl_sspl.certification.loop.closed_loop`; the levels are tried in their
     order, each with this budget.
 
     Example:

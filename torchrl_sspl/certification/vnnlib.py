@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from torchrl_sspl.certification.conditions import ClosedLoop
 from torchrl_sspl.certification.graph import Affine, Apply, Graph
+from torchrl_sspl.certification.loop import ClosedLoop
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.files import write
 

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_sspl.certification.conditions import closed_loop_lipschitz
+from torchrl_sspl.certification.loop import closed_loop_lipschitz
 from torchrl_sspl.certification.record import NOTHING, RIMS, Counts, Record
 from torchrl_sspl.certification.statistics import fingerprint, largest_error_bound, paper_numbers
 from torchrl_sspl.configs.reader import EnvFactory, resolve

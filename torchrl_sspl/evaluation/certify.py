@@ -32,9 +32,10 @@ from torchrl_sspl.certification.certificate import (
     differences,
     weights_digest,
 )
-from torchrl_sspl.certification.conditions import closed_loop, tolerates
+from torchrl_sspl.certification.conditions import tolerates
 from torchrl_sspl.certification.floating import UNITS
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
+from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.certification.record import Record
 from torchrl_sspl.certification.rounding import missed, shown
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer

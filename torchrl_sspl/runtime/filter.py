@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 
-from torchrl_sspl.certification.conditions import closed_loop
 from torchrl_sspl.certification.floating import UNITS, largest_rounding
+from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.modules.agent import Agent

@@ -18,7 +18,8 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from torchrl_sspl.certification.conditions import closed_loop, find_counterexamples
+from torchrl_sspl.certification.conditions import find_counterexamples
+from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.direction import within
 from torchrl_sspl.functional import safe_hinge
