@@ -138,7 +138,7 @@ def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_pat
 
     work = experiment(tmp_path, "synthesis.choices=2", "synthesis.grid=401", "synthesis.tolerated_error=0.02", "synthesis.guard=0.0").work
     work.networks["dynamics"] = Line()
-    work.originals["dynamics"], work.taught, work.seen_dim = Line(), lambda z: torch.zeros(len(z), 1), None
+    work.originals["dynamics"], work.teacher_policy, work.seen_dim = Line(), lambda z: torch.zeros(len(z), 1), None
     z = torch.linspace(-1, 1, 401)[:, None]
     queries = torch.tensor([[0.0], [0.09], [0.13], [0.5], [-0.5]])
     target, member, action, _ = _grid_targets(work, z, z[:, 0].abs() < 0.1, queries)

@@ -31,7 +31,7 @@ from torchrl_sspl.trainers.source import Source
 
 LOG_FILE = "log.jsonl"
 _MOST_ACTIONS = 729  # in the grid that is tried at every latent
-_PLAIN = ("kept_share", "told", "level", "warnings", "skip")  # of a workspace's state, what JSON can write
+_PLAIN = ("kept_share", "logged_round", "level", "warnings", "skip")  # of a workspace's state, what JSON can write
 
 
 def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
@@ -206,9 +206,9 @@ class Workspace:
         self.gain = gain_matrix(self.config.gain, self.latent_dim, self.seen_dim)
         self.latents: dict[str, Tensor] = {}
         self.counterexamples = torch.zeros(0, self.latent_dim)
-        self.taught: nn.Module | None = None
+        self.teacher_policy: nn.Module | None = None  # the policy that TeachPolicy left; targets are made of it
         self.kept_share: float | None = None  # of the latents outside U, what can be kept under the observed errors
-        self.told: int | None = None  # round of which this is in the log
+        self.logged_round: int | None = None  # of which this is in the log
         self.best: dict[str, Any] | None = None
         self.checks: list[Check] = []
         self.level = 0.0  # {B <= level} is the set
@@ -311,8 +311,8 @@ class Workspace:
 
     def log_once(self, row: dict[str, Any]) -> None:
         """Log what is computed once a round, and again where a run goes on in the middle of one."""
-        if self.told != self.where["round"]:
-            self.told = self.where["round"]
+        if self.logged_round != self.where["round"]:
+            self.logged_round = self.where["round"]
             self.log(row)
 
     def state_dict(self) -> dict[str, Any]:
@@ -324,7 +324,7 @@ class Workspace:
             "networks": self.networks.state_dict(),
             "latents": dict(self.latents),
             "counterexamples": self.counterexamples,
-            "taught": None if self.taught is None else self.taught.state_dict(),
+            "teacher_policy": None if self.teacher_policy is None else self.teacher_policy.state_dict(),
             "best": self.best,
             "plain": json.dumps(plain),
             "loop": self.loop.state_dict(),
@@ -335,9 +335,9 @@ class Workspace:
         state = _own(state)
         self.networks.load_state_dict(state["networks"])
         self.latents, self.counterexamples, self.best = dict(state["latents"]), state["counterexamples"], state["best"]
-        if state["taught"] is not None:
-            self.taught = copy.deepcopy(self.policy).requires_grad_(False)
-            self.taught.load_state_dict(state["taught"])
+        if state["teacher_policy"] is not None:
+            self.teacher_policy = copy.deepcopy(self.policy).requires_grad_(False)
+            self.teacher_policy.load_state_dict(state["teacher_policy"])
         plain = json.loads(state["plain"])
         for key in _PLAIN:
             setattr(self, key, plain[key])

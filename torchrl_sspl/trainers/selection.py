@@ -25,6 +25,7 @@ _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away 
 _UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
 _STEP, _TRIED = 2, 6  # levels between two for which a proof is tried, and how many of these
 _BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
+_Count = tuple[str, int, float]  # of what, how many, and how many there may be
 
 
 @dataclass
@@ -79,8 +80,7 @@ class CheckRound(Phase):
     def _proved(self, work: Workspace, held_out: _HeldOut, levels: list[float]) -> Check | None:
         """The largest set that is proved to be kept and passes, with its memory held in it, among a few levels; or None."""
         s = work.config
-        most = s.safe_share * len(held_out.safe)
-        apart = [v for v in levels if (mixed := self._mixed(held_out, v, s.guard))[0] == 0 and mixed[1] <= most]
+        apart = [v for v in levels if all(found <= most for _, found, most in self._mixed(work, held_out, v))]
         for level in apart[::_STEP][:_TRIED]:
             agent = work.agent(level)
             agent.description["tolerated_error"] = tolerated = premise(agent)
@@ -94,9 +94,11 @@ class CheckRound(Phase):
         return None
 
     @staticmethod
-    def _mixed(held_out: _HeldOut, level: float, guard: float) -> tuple[int, int]:
+    def _mixed(work: Workspace, held_out: _HeldOut, level: float) -> tuple[_Count, _Count]:
         """Observations of U inside the set, and of S outside."""
-        return int((held_out.unsafe <= level + guard).sum()), int((held_out.safe > level).sum())
+        s = work.config
+        inside, outside = held_out.unsafe <= level + s.guard, held_out.safe > level
+        return ("unsafe inside", int(inside.sum()), 0), ("safe outside", int(outside.sum()), s.safe_share * len(outside))
 
     @staticmethod
     def _covered(run: Episodes, agent: Agent) -> float:
@@ -138,16 +140,16 @@ class CheckRound(Phase):
         inside = run.barrier[0] <= level
         left = int((inside & (run.barrier[1:] > level).any(0)).sum())
         touched = int(((run.barrier <= level) & late).any(0).sum())
-        bad, out = self._mixed(held_out, level, s.guard)
+        mixed = self._mixed(work, held_out, level)
         returned = float(((back.barrier[-1] <= level) & (back.region[-1] != UNSAFE)).float().mean())
         size = float((held_out.anywhere <= level).float().mean())
-        tolerated = s.leave_share * int(inside.sum())
-        counts = (("unsafe inside", bad, 0), ("safe outside", out, s.safe_share * len(held_out.safe)), ("left", left, tolerated), ("touched U", touched, 0))
+        counts = (*mixed, ("left", left, s.leave_share * int(inside.sum())), ("touched U", touched, 0))
         faults = [f"{name} {found}" for name, found, most in counts if found > most]
         drift = held_out.drift[inside]
         if bool((drift > held_out.largest_innovation).any()):
             faults.append(f"innovations with a mean of up to {float(drift.max()):.2g}")
         passed = not faults and size > 0
+        bad, out = (found for _, found, _ in mixed)
         return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults))
 
 

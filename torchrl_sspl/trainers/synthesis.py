@@ -211,7 +211,7 @@ class TeachPolicy(_Training):
             return loss.terms(LatentBatch(z[rows]), value[rows])
 
         work.loop(self.size(work), {work.policy: 3e-3}, step)
-        work.taught = copy.deepcopy(work.policy).requires_grad_(False)
+        work.teacher_policy = copy.deepcopy(work.policy).requires_grad_(False)
 
 
 class FitSets(_Training):

@@ -188,7 +188,7 @@ def _clearance_targets(
 def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -> tuple[Tensor, ...]:
     """Signed distance to what some action of the table keeps, whatever error is added, on a grid over the latent domain; and the
     taught policy."""
-    s, taught, turns = work.config, work.taught or work.policy, work.direction
+    s, teacher, turns = work.config, work.teacher_policy or work.policy, work.direction
     seen, hidden = work.seen_dim or work.latent_dim, work.latent_dim - (work.seen_dim or work.latent_dim)
     looks_unsafe, room = z[unsafe][:, :seen], max(s.guard, 1.0 / (s.grid - 1))  # at least half of a cell
     low, sizes, period = [-1.0] * seen, [s.grid] * seen, [0.0] * seen
@@ -212,7 +212,7 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     target = (_SLOPE * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
     work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
     work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
-    return target, target <= 0.0, taught(z), torch.ones(len(z))
+    return target, target <= 0.0, teacher(z), torch.ones(len(z))
 
 
 def _signed_distance(found: ViabilityKernel, queries: Tensor) -> Tensor:
@@ -267,9 +267,9 @@ def _unsafe_margin(work: Workspace, seen: Tensor, unsafe: Tensor) -> Callable[[T
 @torch.no_grad()
 def _value_targets(work: Workspace, z: Tensor, region: Tensor, queries: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
     """Minus the margin that the taught policy keeps, or the best of the actions to choose from; and the taught policy itself."""
-    s, taught = work.config, work.taught or work.policy
+    s, teacher = work.config, work.teacher_policy or work.policy
     unsafe, safe = region[:, 0] == UNSAFE, region[:, 0] == SAFE
-    action = taught(z)
+    action = teacher(z)
     margin = signed_margin(z, unsafe)
     following, mean = work.dynamics(z, action)[:, None], errors[:, :1]
     if s.choices:
