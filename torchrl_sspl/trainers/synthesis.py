@@ -22,7 +22,6 @@ from torchrl_sspl.certification.conditions import find_counterexamples
 from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.direction import within
-from torchrl_sspl.functional import safe_hinge
 from torchrl_sspl.modules.observer import corrected, gain_matrix
 from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
 from torchrl_sspl.objectives.base import LatentBatch
@@ -417,7 +416,8 @@ class Settle(Tighten):
         )  # fmt: skip
         table, rim = targets(work, self.number)
         unsafe, safe = ((table["region"][:, 0] == code).nonzero()[:, 0] for code in (UNSAFE, SAFE))
-        target = self._target(work, safe_coeff=0.0)  # S may reach to the border of what can be kept: no margin is asked there
+        target = self._target(work, safe_coeff=0.0)  # S may reach to the border of what can be kept: hardly any margin is asked there
+        of_safe = TargetLoss(work.barrier, work.policy, safety_margin=_SPARE, safe_coeff=_LEAST_WEIGHT).select_out_keys("loss_safe")
 
         def worst(rows: Tensor, count: int, high: bool) -> TensorDict:
             drawn = rows[pick(len(rows), 4 * s.batch)]
@@ -441,8 +441,7 @@ class Settle(Tighten):
             drawn = [table[pick(len(table), s.batch)], worst(unsafe, s.batch // 2, False)]
             terms |= dict(target(torch.cat(drawn)).items())
             if len(safe) and not s.safe_share:
-                missed = safe_hinge(work.barrier(worst(safe, s.batch // 4, True)["latent"]), _SPARE)
-                terms["loss_safe"] = _LEAST_WEIGHT * missed.mean()
+                terms |= dict(of_safe(worst(safe, s.batch // 4, True)).items())
             return terms
 
         work.loop(self.size(work), self.rates(work), step)
