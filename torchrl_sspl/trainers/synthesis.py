@@ -58,8 +58,8 @@ _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for
 _WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
 _MEMORY = 9  # nodes of the grid per entry that no picture shows
 _TURNS = 24  # ... around a direction
-_SEPARATE = 2000  # steps in which U is told from the rest
-_UNSAFE_FIRST = 6.0  # how much more a picture of U counts there
+_SEPARATE = 8000  # steps in which U is told from the rest: a border that is not sharp costs volume
+_UNSAFE_FIRST = 3.0  # how much more a picture of U counts there
 _SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
 _NEAR_ZERO = 0.06  # of these targets, those that a batch has as many of as of all
 _DEPTH = 0.25  # barrier value up to which the targets on a grid go
@@ -408,18 +408,24 @@ class Tighten(FineTune):
         return z[worst.indices[worst.values > -0.01]]
 
     @staticmethod
-    @torch.enable_grad()
-    def _ascend(work: Workspace, latent: Tensor, steps: int = 12) -> Tensor:
-        """Latents of the set after which the barrier is higher: samples alone miss narrow peaks."""
-        z = latent
-        for k in range(steps):
-            z = z.detach().requires_grad_()
-            here = work.barrier(z)[:, 0]
-            value = work.barrier(work.dynamics(z, work.acting(z).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
-            (slope,) = torch.autograd.grad(value.sum(), z)
-            z = within(z + 0.03 * 0.8**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
-        z = z.detach()
-        return z[work.barrier(z)[:, 0] <= 0.02]
+    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 12) -> Tensor:
+        """Latents of the set ``(n, p)`` after which the barrier is highest, climbed to from as many: samples alone miss narrow
+        peaks, and so does one climb with steps that shrink."""
+        best = latent
+        for _ in range(restarts):
+            z = best
+            for k in range(steps):
+                with torch.enable_grad():
+                    at = z.detach().requires_grad_()
+                    here = work.barrier(at)[:, 0]
+                    value = work.barrier(work.dynamics(at, work.acting(at).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
+                    (slope,) = torch.autograd.grad(value.sum(), at)
+                z = within(z + 0.03 * 0.8**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
+            best = torch.cat([best, z])
+            after = work.barrier(work.dynamics(best, work.acting(best)))[:, 0]
+            inside = work.barrier(best)[:, 0] <= _SPARE
+            best = best[torch.where(inside, after, -math.inf).topk(len(latent)).indices]
+        return best[work.barrier(best)[:, 0] <= 0.02]
 
 
 class Settle(Tighten):
