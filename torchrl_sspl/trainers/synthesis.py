@@ -10,6 +10,7 @@ and policy onto the largest robust invariant set of the cloud of latents (or the
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -385,18 +386,24 @@ class Tighten(FineTune):
         return z[worst.indices[worst.values > -0.01]]
 
     @staticmethod
-    @torch.enable_grad()
-    def _ascend(work: Workspace, latent: Tensor, steps: int = 12) -> Tensor:
-        """Latents of the set after which the barrier is higher: samples alone miss narrow peaks."""
-        z = latent
-        for k in range(steps):
-            z = z.detach().requires_grad_()
-            here = work.barrier(z)[:, 0]
-            value = work.barrier(work.dynamics(z, work.acting(z).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
-            (slope,) = torch.autograd.grad(value.sum(), z)
-            z = within(z + 0.03 * 0.8**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
-        z = z.detach()
-        return z[work.barrier(z)[:, 0] <= 0.02]
+    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 12) -> Tensor:
+        """Latents of the set ``(n, p)`` after which the barrier is highest, climbed to from as many: samples alone miss narrow
+        peaks, and so does one climb with steps that shrink."""
+        best = latent
+        for _ in range(restarts):
+            z = best
+            for k in range(steps):
+                with torch.enable_grad():
+                    at = z.detach().requires_grad_()
+                    here = work.barrier(at)[:, 0]
+                    value = work.barrier(work.dynamics(at, work.acting(at).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
+                    (slope,) = torch.autograd.grad(value.sum(), at)
+                z = within(z + 0.03 * 0.8**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
+            best = torch.cat([best, z])
+            after = work.barrier(work.dynamics(best, work.acting(best)))[:, 0]
+            inside = work.barrier(best)[:, 0] <= _SPARE
+            best = best[torch.where(inside, after, -math.inf).topk(len(latent)).indices]
+        return best[work.barrier(best)[:, 0] <= 0.02]
 
 
 class Settle(Tighten):

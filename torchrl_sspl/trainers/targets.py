@@ -38,8 +38,8 @@ _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data t
 _GRID_ROOM = 4.0  # ... that the one on a grid tolerates
 _MEMORY = 9  # nodes of the grid per entry that no picture shows
 _TURNS = 24  # ... around a direction
-_SEPARATE = 2000  # steps in which U is told from the rest
-_UNSAFE_FIRST = 6.0  # how much more a picture of U counts there
+_SEPARATE = 8000  # steps in which U is told from the rest: a border that is not sharp costs volume
+_UNSAFE_FIRST = 3.0  # how much more a picture of U counts there
 _SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
 _DEPTH = 0.25  # barrier value up to which the targets on a grid go
 
