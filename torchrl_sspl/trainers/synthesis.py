@@ -39,7 +39,7 @@ from torchrl_sspl.viability.cloud import (
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
-_WEIGHT, _LEAST_WEIGHT = 2.0, 20.0  # of counterexamples
+_WEIGHT, _LEAST_WEIGHT = 2.0, 40.0  # of counterexamples
 _NEAR_ZERO = 0.06  # of the targets on a grid, those that a batch has as many of as of all
 _POOL = 8192  # counterexamples that are kept
 _STARTS = 2048  # latents from which they are climbed to
@@ -419,7 +419,7 @@ class Settle(Tighten):
             work.counterexamples = torch.zeros(0, work.latent_dim)
         self._loss = CounterexampleLoss(
             work.dynamics, work.barrier, work.acting, mode="least", depth=_SPARE, dynamics_margin=_SPARE, error=s.tolerated_error,
-            worst_coeff=0.3, worst_fraction=0.02,
+            worst_coeff=1.0, worst_fraction=0.01,
         )  # fmt: skip
         table, rim = targets(work, self.number)
         unsafe, safe = ((table["region"][:, 0] == code).nonzero()[:, 0] for code in (UNSAFE, SAFE))
@@ -441,7 +441,8 @@ class Settle(Tighten):
                 work.counterexamples = self._search(work, rim["latent"])
             asked = [rim["latent"][pick(len(rim), s.batch)]]
             if len(work.counterexamples):
-                asked.append(work.counterexamples[pick(len(work.counterexamples), s.batch)])
+                known = len(work.counterexamples)  # the worst come first, and more often
+                asked.append(work.counterexamples[pick(known, s.batch).square() // known])
             latent = torch.cat(asked)
             terms = dict(self._loss(TensorDict(latent=latent, batch_size=[len(latent)])).items())
             terms["loss_counterexample"] = _LEAST_WEIGHT * terms["loss_counterexample"]

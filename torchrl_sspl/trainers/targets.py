@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,18 +31,19 @@ from torchrl_sspl.viability.cloud import (
     signed_margin,
     value_targets,
 )
-from torchrl_sspl.viability.grid import Grid
+from torchrl_sspl.viability.grid import Grid, one_step_value
 
 _KNOWN_WITHIN = 0.06  # distance from the data beyond which a way back is not looked for
 _SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerated, the first that keeps S
 _KEPT_OF_SAFE = 0.9
 _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data tolerates
 _GRID_ROOM = 4.0  # ... that the one on a grid tolerates
-_MEMORY = 9  # nodes of the grid per entry that no picture shows
-_TURNS = 24  # ... around a direction
+_TURNS = 32  # nodes of the grid around a direction
+_MEMORY = 17  # ... per entry that no picture shows, on the finer grid
 _SEPARATE = 8000  # steps in which U is told from the rest: a border that is not sharp costs volume
 _UNSAFE_FIRST = 3.0  # how much more a picture of U counts there
 _SLOPE = 0.9  # of the targets on a grid, of the barrier's Lipschitz constant
+_PART = 1 << 17  # nodes that are looked at together
 _DEPTH = 0.25  # barrier value up to which the targets on a grid go
 
 
@@ -200,29 +203,46 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
         signs = signs[(signs.abs().sum(1) != 2)]
     length = signs.norm(dim=1, keepdim=True).clamp_min(1.0)
     errors = F.pad(_GRID_ROOM * s.tolerated_error * signs / length, (0, hidden))
-    low, sizes, period = low + [-1.0] * hidden, sizes + [_MEMORY] * hidden, period + [0.0] * hidden
+    actions = action_grid(work.action_scale, s.choices or s.actions)
+    held = [len(actions[:, k].unique()) for k in range(hidden)]  # the memory holds the last action: these are the nodes
+    low, sizes, period = low + [-1.0] * hidden, sizes + held, period + [0.0] * hidden
     margin = _unsafe_margin(work, z[:, :seen], unsafe) if turns is not None else lambda x: nearest_distance(x[:, :seen], looks_unsafe)
-    found = viability_kernel(
-        lambda x, u: charted(work.dynamics(lifted(x, turns), u), turns), low=low, high=[-v for v in low], resolution=sizes, period=period, errors=errors,
-        margin=lambda x: margin(lifted(x, turns)) - room, actions=action_grid(work.action_scale, s.choices or s.actions), exit_is_safe=False,
-    )  # fmt: skip
+    step = partial(_charted_step, work)
+    system: dict[str, Any] = {"margin": lambda x: margin(lifted(x, turns)) - room, "actions": actions, "errors": errors}
+    found = viability_kernel(step, low=low, high=[-v for v in low], resolution=sizes, period=period, exit_is_safe=False, **system)
     if not bool((found.value > 0.0).any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
         found = replace(found, value=found.margin)
-    distance = _signed_distance(found, charted(queries, turns))
+    sizes = [2 * n - (not p) for n, p in zip(sizes, period, strict=True)]
+    fine = Grid(low, [-v for v in low], sizes[: len(sizes) - hidden] + [_MEMORY] * hidden, period)
+    distance = _signed_distance(fine, _inside(found, fine, step, **system), charted(queries, turns))
     target = (_SLOPE * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
     work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
     work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
     return target, target <= 0.0, teacher(z), torch.ones(len(z))
 
 
-def _signed_distance(found: ViabilityKernel, queries: Tensor) -> Tensor:
-    """Distance of queries ``(n, d)`` to a set on a grid, ``(n,)``, negative inside: exact at the nodes of a grid twice as fine, on which
-    the values are interpolated, and interpolated between them."""
-    around = [bool(p) for p in found.grid.period]
-    fine = Grid(found.grid.low, found.grid.high, [2 * n - (not p) for n, p in zip(found.grid.shape, around, strict=True)], found.grid.period)
-    inside = (found.interpolate(fine.nodes()) > 0.0).reshape(fine.shape).numpy()
+def _charted_step(work: Workspace, chart: Tensor, action: Tensor) -> Tensor:
+    turns = work.direction
+    return charted(work.dynamics(lifted(chart, turns), action), turns)
+
+
+def _inside(found: ViabilityKernel, fine: Grid, step: Callable[[Tensor, Tensor], Tensor], **system: Any) -> np.ndarray:
+    """Which nodes of a finer grid belong to a set on a grid: where its values are not cut, by one step from them.
+
+    Between left and right of an obstacle the values have a valley, which interpolation fills up.
+    """
+    nodes, cut = fine.nodes(), float(found.value.abs().max())
+    value = torch.cat([found.interpolate(part) for part in nodes.split(_PART)])
+    for rows in (value.abs() < 0.99 * cut).nonzero()[:, 0].split(_PART):
+        value[rows] = one_step_value(found, nodes[rows], step, **system)
+    return (value > 0.0).reshape(fine.shape).numpy()
+
+
+def _signed_distance(fine: Grid, inside: np.ndarray, queries: Tensor) -> Tensor:
+    """Distance of queries ``(n, d)`` to a set of nodes, ``(n,)``, negative inside: exact at the nodes, and interpolated between them."""
     if inside.all() or not inside.any():
         return torch.full((len(queries),), -math.inf if inside.all() else math.inf)
+    around = [bool(p) for p in fine.period]
     half = 0.5 * fine.step[0]  # the border lies between two nodes
     wide = [(n // 4, n // 4) if p else (0, 0) for n, p in zip(fine.shape, around, strict=True)]  # what lies behind the seam
     inside = np.pad(inside, wide, mode="wrap")

@@ -330,8 +330,6 @@ class _Problem:
             raise ShapeError(f"margin: expected shape {(nodes.shape[0],)}, received {tuple(self.margin.shape)}.")
         if errors is not None and (errors.ndim != 2 or errors.shape[1] != nodes.shape[1] or not len(errors)):
             raise ShapeError(f"errors: expected shape (j, {nodes.shape[1]}), received {tuple(errors.shape)}.")
-        around = torch.tensor([bool(p) for p in self.grid.period])
-        ends = [torch.tensor(v).masked_fill(around, s * math.inf) for s, v in ((-1.0, self.grid.low), (1.0, self.grid.high))]
         self.successors = []  # per action, for every error: cell, position in it, outside
         for action in actions.to(nodes):
             after = dynamics(nodes, action.expand(nodes.shape[0], -1))
@@ -339,8 +337,7 @@ class _Problem:
                 raise ShapeError(f"dynamics: expected shape {tuple(nodes.shape)}, received {tuple(after.shape)}.")
             if torch.isnan(after).any():
                 raise NonFiniteError("dynamics: expected finite states, received NaN for a node of the grid.")
-            moved = [after] if errors is None else [torch.minimum(torch.maximum(after + e, ends[0]), ends[1]) for e in errors.to(after)]
-            self.successors.append([self.grid.locate(a) for a in moved])
+            self.successors.append([self.grid.locate(a) for a in _moved(self.grid, after, errors)])
 
     def best_successor(self, value: Tensor, cut: float) -> Tensor:
         """Largest value among the successors of each node, ``(nodes,)``; beyond the box it is +- ``cut``."""
@@ -356,6 +353,44 @@ class _Problem:
             best = reached if best is None else torch.maximum(best, reached, out=best)
         assert best is not None
         return best
+
+
+def _moved(grid: Grid, after: Tensor, errors: Tensor | None) -> list[Tensor]:
+    """Successors ``(n, d)`` with each of the errors ``(j, d)`` added, which do not leave the box by that."""
+    if errors is None:
+        return [after]
+    around = torch.tensor([bool(p) for p in grid.period])
+    low, high = (torch.tensor(v).masked_fill(around, s * math.inf) for s, v in ((-1.0, grid.low), (1.0, grid.high)))
+    return [torch.minimum(torch.maximum(after + e, low), high) for e in errors.to(after)]
+
+
+@torch.no_grad()
+def one_step_value(
+    kernel: ViabilityKernel, state: Tensor, dynamics: Dynamics, *, margin: Callable[[Tensor], Tensor], actions: Tensor, errors: Tensor | None = None
+) -> Tensor:
+    """Value ``(n,)`` of states ``(n, d)`` by one step of the iteration from them; exacter than interpolating where the grid is coarse.
+
+        V(x) = min(l(x), max_u min_e V(f(x, u) + e))
+
+    Args:
+        kernel: what the iteration came to.
+        state: anywhere in the box.
+        dynamics, margin, actions, errors: those of :func:`viability_kernel`.
+
+    Source: none.
+
+    Example:
+        >>> f, l, u = lambda x, u: 1.5 * x + u, lambda x: 1 - x[:, 0].abs(), torch.linspace(-0.1, 0.1, 5)[:, None]
+        >>> coarse = viability_kernel(f, low=[-1.2], high=[1.2], resolution=25, margin=l, actions=u)
+        >>> bool(one_step_value(coarse, torch.tensor([[0.15]]), f, margin=l, actions=u) > 0)
+        True
+    """
+    best = torch.full((len(state),), -math.inf)
+    for action in actions.to(state):
+        after = dynamics(state, action.expand(len(state), -1))
+        reached = torch.stack([kernel.interpolate(a) for a in _moved(kernel.grid, after, errors)]).amin(0)
+        best = torch.maximum(best, reached)
+    return torch.minimum(best, margin(state))
 
 
 def _outside(region: Region, state: Tensor) -> Tensor:
