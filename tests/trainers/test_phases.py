@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
@@ -33,8 +33,8 @@ from torchrl_sspl.trainers import (
     targets,
 )
 from torchrl_sspl.trainers.phases import action_grid
-from torchrl_sspl.trainers.targets import _grid_targets, _signed_distance
-from torchrl_sspl.viability import ViabilityKernel, viability_kernel
+from torchrl_sspl.trainers.targets import _grid_targets, _inside, _signed_distance
+from torchrl_sspl.viability import viability_kernel
 from torchrl_sspl.viability.grid import Grid
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:init_random_frames")
@@ -153,15 +153,32 @@ def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_pat
 
 def test_distances_on_a_grid_do_not_depend_on_its_cells():
     """A disc in two entries of three; the third has far fewer nodes."""
-    grid = Grid([-1.0] * 3, [1.0] * 3, [41, 41, 5])
-    value = 0.5 - grid.nodes()[:, :2].norm(dim=1)
-    found = ViabilityKernel(value.reshape(grid.shape), value, grid, outside=False, iterations=1, seconds=0.0, change=0.0)
+    grid = Grid([-1.0] * 3, [1.0] * 3, [81, 81, 9])
+    inside = (grid.nodes()[:, :2].norm(dim=1) < 0.5).reshape(grid.shape).numpy()
     queries = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
     true = queries[:, :2].norm(dim=1) - 0.5
     near = true.abs() < 0.3
-    assert float((_signed_distance(found, queries) - true)[near].abs().max()) < 0.03  # of cells of .05 and .5
-    for fill in (1.0, -1.0):
-        assert (_signed_distance(replace(found, value=torch.full(grid.shape, fill)), queries) == -fill * math.inf).all()
+    assert float((_signed_distance(grid, inside, queries) - true)[near].abs().max()) < 0.03  # of cells of .025 and .25
+    for fill in (True, False):
+        assert (_signed_distance(grid, np.full(grid.shape, fill), queries) == (-math.inf if fill else math.inf)).all()
+
+
+def test_a_finer_grid_does_not_fill_up_the_valley_between_left_and_right():
+    """Where one moves away from a ridge on which nothing is kept, values on either side of it are the same."""
+    ridge = 0.025  # between two nodes of the coarse grid
+
+    def margin(x):
+        return (x[:, 0] - ridge).abs() - 0.015
+
+    def step(x, u):
+        return x
+
+    system = {"margin": margin, "actions": torch.zeros(1, 1), "errors": None}
+    found = viability_kernel(step, low=[-1.0], high=[1.0], resolution=41, exit_is_safe=True, **system)
+    fine = Grid([-1.0], [1.0], [401])
+    on_ridge = (fine.nodes()[:, 0] - ridge).abs() < 0.012
+    assert not _inside(found, fine, step, **system)[on_ridge.numpy()].any()
+    assert (found.interpolate(fine.nodes()) > 0.0)[on_ridge].any()
 
 
 def test_counterexamples_that_no_sample_hits_are_climbed_to():

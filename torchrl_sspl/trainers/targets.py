@@ -206,7 +206,10 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     actions = action_grid(work.action_scale, s.choices or s.actions)
     held = [len(actions[:, k].unique()) for k in range(hidden)]  # the memory holds the last action: these are the nodes
     low, sizes, period = low + [-1.0] * hidden, sizes + held, period + [0.0] * hidden
-    margin = _unsafe_margin(work, z[:, :seen], unsafe) if turns is not None else lambda x: nearest_distance(x[:, :seen], looks_unsafe)
+    if turns is not None:
+        margin = _unsafe_margin(work, z[:, :seen], unsafe)
+    else:  # what lies in the middle between two samples is no tie
+        margin = lambda x: nearest_distance(x[:, :seen], looks_unsafe) - 0.1 / (s.grid - 1)  # noqa: E731
     step = partial(_charted_step, work)
     system: dict[str, Any] = {"margin": lambda x: margin(lifted(x, turns)) - room, "actions": actions, "errors": errors}
     found = viability_kernel(step, low=low, high=[-v for v in low], resolution=sizes, period=period, exit_is_safe=False, **system)
