@@ -42,7 +42,8 @@ _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for
 _WEIGHT, _LEAST_WEIGHT = 2.0, 40.0  # of counterexamples
 _NEAR_ZERO = 0.06  # of the targets on a grid, those that a batch has as many of as of all
 _POOL = 8192  # counterexamples that are kept
-_STARTS = 2048  # latents from which they are climbed to
+_LOOK_EVERY = 25  # steps between two searches where hardly any are left
+_STARTS = 1024  # latents from which they are climbed to
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
@@ -437,8 +438,8 @@ class Settle(Tighten):
             return table[drawn[found]].set("latent", latent[found])
 
         def step() -> dict[str, Tensor]:
-            if work.loop.step % 100 == 0:
-                work.counterexamples = self._search(work, rim["latent"])
+            if work.loop.step % _LOOK_EVERY == 0:  # those that are known are gone after a few steps, others have come up
+                work.counterexamples = self._search(work, rim["latent"], samples=30_000)
             asked = [rim["latent"][pick(len(rim), s.batch)]]
             if len(work.counterexamples):
                 known = len(work.counterexamples)  # the worst come first, and more often
