@@ -59,14 +59,15 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 @pytest.mark.slow
-def test_wheel_holds_the_package_its_types_and_the_agents(built):
+def test_wheel_holds_the_package_its_types_the_agents_and_the_templates(built):
     names = zipfile.ZipFile(built[0]).namelist()
     sources = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_sspl").rglob("*.py") if "__pycache__" not in p.parts}
     assert sources <= set(names)
     assert "torchrl_sspl/py.typed" in names
-    agents = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_sspl" / "agents").rglob("*") if p.is_file()}
-    assert agents
-    assert agents <= set(names)
+    for folder in ("agents", "viz/templates"):
+        files = {str(p.relative_to(ROOT)) for p in (ROOT / "torchrl_sspl" / folder).rglob("*") if p.is_file()}
+        assert files
+        assert files <= set(names)
     assert not [n for n in names if n.startswith(("tests/", "docs/", "examples/")) or n.endswith(".pyc")]
     assert any(n.endswith("licenses/LICENSE") for n in names)
 

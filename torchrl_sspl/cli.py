@@ -21,7 +21,7 @@ _USAGE = """sspl COMMAND ...
   evaluate  measure an agent again, on fresh data
   verify    check the certificates of an agent again
   compare   a page with several runs beside each other
-  watch     see an agent at work: picture, barrier, verdict, interventions
+  watch     see an agent at work (picture, barrier, verdict, interventions), or a training while it runs
   calibrate limits of the monitor's signals, from clean episodes of an agent's system
   export    one step of an agent as .onnx or .pt2"""
 _TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
@@ -251,9 +251,11 @@ def _compare(words: list[str]) -> int:
 
 
 def _watch(words: list[str]) -> int:
-    """Show an agent at work on a page that is served from this machine."""
-    parser = argparse.ArgumentParser(prog="sspl watch", description="See an agent at work, on a page served from this machine.")
-    parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory with a calibration")
+    """Show an agent at work, or a training, on a page that is served from this machine."""
+    text = "See an agent at work, or a training while it runs, on a page served from this machine."
+    parser = argparse.ArgumentParser(prog="sspl watch", description=text)
+    text = "name of a shipped agent, such as pendulum, or a run directory: with a calibrated agent, that agent; else its training"
+    parser.add_argument("agent", help=text)
     parser.add_argument("--env", help="a system as in `sspl train env=...`, or physics: its own one in full physics; default: its own one")
     parser.add_argument("--video", metavar="FILE", help="a film in place of a system")
     parser.add_argument("--policy", choices=("own", "random"), default="own", help="what acts (default: own)")
@@ -261,7 +263,7 @@ def _watch(words: list[str]) -> int:
     parser.add_argument("--record", metavar="FILE.mp4", help="write a film of it")
     parser.add_argument("--host", default="127.0.0.1", help="address of the page; another one than 127.0.0.1 shows it to others")
     parser.add_argument("--port", type=int, default=8000, help="its port, 0: any that is free (default: 8000)")
-    parser.add_argument("--steps", type=int, help="end after so many; default: with Ctrl-C")
+    parser.add_argument("--steps", type=int, help="end after so many (of a training: changes); default: with Ctrl-C")
     parser.add_argument("--fps", type=float, help="steps per second; default: those of the system or the film")
     parser.add_argument("--noise", type=float, default=1.0, help="of a system's camera, grey levels (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="of what is drawn")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 from types import SimpleNamespace
 
 import pytest
@@ -50,6 +51,24 @@ def test_phase_loss_and_volume_are_in_the_bar_and_the_loss_is_asked_for_once_a_s
     assert 3 <= len(asked) <= 5
 
 
+def test_a_file_says_the_same_without_a_bar_until_the_end(clock, tmp_path):
+    bar, file = Progress(30, 10, shown=False, out_dir=tmp_path), tmp_path / "progress.json"
+    bar.begin("fitting", 20, left=2)
+    assert json.loads(file.read_text()) == {"phase": "fitting", "done": 10, "total": 30, "left": "2 phases follow"}
+    for _ in range(4):
+        clock.seconds += 2.0
+        bar.tick(lambda: pytest.fail("a loss was asked for"))
+    assert json.loads(file.read_text()) == {"phase": "fitting", "done": 14, "total": 30, "left": "32 s left of this phase, then 2 more"}
+    file.unlink()
+    file.mkdir()  # what cannot be written does not end a training
+    clock.seconds += 2.0
+    bar.tick(lambda: None)
+    file.rmdir()
+    bar.show()
+    bar.close()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_what_is_not_shown_asks_for_nothing():
     bar = Progress(10, 0, shown=False)
     bar.begin("a", 10)
@@ -70,7 +89,8 @@ def test_every_round_ends_with_a_sentence(capsys):
 
     loop = SimpleNamespace(step=0, restart=lambda: None, loss=None)
     work = SimpleNamespace(
-        checks=[], config=SimpleNamespace(check_episodes=4000), loop=loop, skip=False, begin=lambda: None, finish=lambda: None
+        checks=[], config=SimpleNamespace(check_episodes=4000), loop=loop, skip=False, begin=lambda: None, finish=lambda: None,
+        out_dir=None,
     )
     Phases([Checked(0)], work, progress=True).run()
     said = "".join(capsys.readouterr())

@@ -353,7 +353,12 @@ def test_the_log_holds_the_means_over_the_steps_on_a_batch(tmp_path: Path) -> No
 
 
 def test_every_batch_leaves_a_line_in_the_log_and_a_loss_that_is_not_finite_stops(tmp_path: Path) -> None:
-    build(out_dir=tmp_path).train()
+    trainer = build(out_dir=tmp_path)
+    told = set()
+    trainer.register_op("post_optim", lambda: told.add(json.loads((tmp_path / "progress.json").read_text())["total"]))
+    trainer.train()
+    assert told == {24}  # while it runs, a file says how far it is
+    assert not (tmp_path / "progress.json").exists()
     rows = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in rows] == [4 * k for k in range(1, 7)]
     assert {row["phase"] for row in rows} == {"joint"}

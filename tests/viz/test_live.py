@@ -22,7 +22,8 @@ from torchrl_sspl import cli
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.agent import load
-from torchrl_sspl.viz.live import Feed, watch
+from torchrl_sspl.viz.live import watch
+from torchrl_sspl.viz.server import Feed
 
 ffmpeg = pytest.importorskip("imageio_ffmpeg")
 

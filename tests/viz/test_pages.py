@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import json
+
 import pytest
 from browser import BROWSER, browser
 
 pytest.importorskip("matplotlib")
 from torchrl_sspl.certification.certificate import Certificate
+from torchrl_sspl.files import append, write
 from torchrl_sspl.modules.agent import agent_directory
 from torchrl_sspl.viz import requirement_rows, write_report
 from torchrl_sspl.viz.certificate import certificate_section
+from torchrl_sspl.viz.compare import compare
+from torchrl_sspl.viz.pages import render
 from torchrl_sspl.viz.plane import new_figure
+from torchrl_sspl.viz.training import read_training
 from torchrl_sspl.viz.verdict import first_screen
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(BROWSER is None, reason="needs chromium")]
@@ -64,3 +70,39 @@ def test_a_figure_opens_at_full_size_and_closes(report):
         assert page.value(WIDTH) <= 390
         page.value("document.querySelector('.zoom').click()")
         assert page.value(shown) == small
+
+
+LONG = "a_name_that_is_long_and_has_no_place_to_break" * 2
+
+
+def runs(folder):
+    """Directories of runs that differ in a setting, one of them in the middle of its training."""
+    found = [folder / f"{LONG}{k}" for k in range(3)]
+    for k, run in enumerate(found):
+        config = {"seed": 0, "env": {"_target_": LONG}, "synthesis": {"margin": 0.1 * k}}
+        for phase in ("joint", "fit", "tune"):
+            for step in (100, 200, 300):
+                append(run / "log.jsonl", json.dumps({"phase": phase, "round": 0, "step": step, f"loss_{LONG}": 1 / step, "loss_safe": k}))
+        append(run / "log.jsonl", json.dumps({"phase": "check", "round": 0, "step": 0, "size": 0.5, "reason": LONG}))
+        write(run / "metrics.json", json.dumps({"config": config, "measurements": {"own": {LONG: {"value": 0.5 * k, "unit": "share"}}}}))
+    write(found[0] / "progress.json", json.dumps({"phase": LONG, "done": 1, "total": 2, "left": "4 min left of this phase, then 3 more"}))
+    return found
+
+
+@pytest.fixture(scope="module", params=["comparison", "agent at work", "training"])
+def other(request, tmp_path_factory):
+    """The pages that are no reports; the served ones as they are before anything is told."""
+    folder = tmp_path_factory.mktemp("other")
+    if request.param == "comparison":
+        return compare(runs(folder), folder / "page.html")
+    if request.param == "training":
+        return write(folder / "page.html", render("training.html", title=LONG, facts=LONG, **read_training(runs(folder)[0])))
+    return write(folder / "page.html", render("watch.html", title=LONG, facts=LONG))
+
+
+@pytest.mark.parametrize("width", [390, 1400])
+def test_other_pages_do_not_scroll_sideways(other, width):
+    with browser() as page:
+        page.open(other, width, dark=width == 390)
+        page.value("document.querySelectorAll('details').forEach(d => d.open = true)")
+        assert page.value(WIDTH) <= width

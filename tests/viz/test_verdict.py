@@ -93,4 +93,4 @@ def test_a_verdict_stands_only_where_the_bound_reaches_the_must(requirement, eve
     m = share(requirement.name, events, n)
     said = requirement.verdict(SimpleNamespace(measurements={requirement.name: m}))
     assert bounded(requirement, said, m) == verdict
-    assert ("good" in badge(bounded(requirement, said, m))) == (verdict == "aim")
+    assert (badge(bounded(requirement, said, m)).kind == "good") == (verdict == "aim")

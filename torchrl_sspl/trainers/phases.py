@@ -426,7 +426,7 @@ class Phases(TrainerHookBase):
         work.loop.tick = self._tick
         own_bar = self.bar is None
         if own_bar:
-            self.bar = Progress(self.steps, self.steps_done, shown=self.progress)
+            self.bar = Progress(self.steps, self.steps_done, shown=self.progress, out_dir=work.out_dir)
         before = self.bar.n - self.steps_done
         rounds = 1 + max(phase.number for phase in self.phases)
         while not self.finished:

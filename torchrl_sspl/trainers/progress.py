@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
 from typing import Any, TextIO
 
 from tqdm import tqdm
+
+from torchrl_sspl.errors import OutputError
+from torchrl_sspl.files import write
+
+#: In the directory of a run, while it is trained: where it is, for whoever looks from elsewhere.
+PROGRESS_FILE = "progress.json"
 
 #: What the phases do, in words.
 WORDS = {
@@ -29,6 +38,7 @@ class Progress:
         shown: whether there is anything to see.
         resumed: whether an interrupted training goes on.
         file: where it is written; None: standard error.
+        out_dir: directory whose ``progress.json`` says the same, until the end; None: nowhere.
 
     Source: none.
 
@@ -40,10 +50,14 @@ class Progress:
         1
     """
 
-    def __init__(self, total: int, done: int, *, shown: bool = True, resumed: bool = False, file: TextIO | None = None) -> None:
+    def __init__(
+        self, total: int, done: int, *, shown: bool = True, resumed: bool = False, file: TextIO | None = None,
+        out_dir: Path | None = None,
+    ) -> None:  # fmt: skip
         layout = "{desc} {percentage:3.0f}%|{bar}| {n_fmt}/{total_fmt} steps, {elapsed}{postfix}"
         self._bar = tqdm(total=total, initial=done, disable=not shown, bar_format=layout, dynamic_ncols=True, file=file)
         self.shown, self.n, self._note = shown, done, "resumed" if resumed else ""
+        self._total, self._words, self._state = total, "", None if out_dir is None else out_dir / PROGRESS_FILE
         self.kept: float | None = None  # share of what is not U in the set, so far
         self._began, self._first, self._size, self._left, self._looked = time.monotonic(), done, 0, 0, 0.0
         self.begin("starting", 0)
@@ -51,6 +65,7 @@ class Progress:
     def begin(self, words: str, size: int, *, taken: int = 0, left: int = 0) -> None:
         """A phase of so many steps, of which so many were taken before; so many further phases are ``left``."""
         self._began, self._first, self._size, self._left = time.monotonic(), self.n, size - taken, left
+        self._words = words
         self._bar.set_description_str(words, refresh=False)
         self.show()
 
@@ -58,9 +73,9 @@ class Progress:
         """One step; the loss is asked for once a second at most."""
         self.n += 1
         self._bar.update()
-        if self.shown and time.monotonic() - self._looked >= _EVERY:
+        if (self.shown or self._state) and time.monotonic() - self._looked >= _EVERY:
             self._looked = time.monotonic()
-            self.show(loss())
+            self.show(loss() if self.shown else None)
 
     def show(self, loss: float | None = None) -> None:
         """Loss, volume and time left."""
@@ -71,6 +86,9 @@ class Progress:
             parts.append(f"safe set {self.kept:.0%} of what is not U")
         parts.append(self.eta())
         self._bar.set_postfix_str(", ".join(p for p in parts if p), refresh=self.shown)
+        if self._state is not None:
+            with suppress(OutputError):  # nobody has to look
+                write(self._state, json.dumps({"phase": self._words, "done": self.n, "total": self._total, "left": self.eta()}) + "\n")
 
     def eta(self) -> str:
         """Time that the phase still takes, "" while nothing is known of it."""
@@ -93,6 +111,9 @@ class Progress:
     def close(self) -> None:
         """The bar stays where it is."""
         self._bar.close()
+        if self._state is not None:
+            with suppress(OSError):
+                self._state.unlink(missing_ok=True)
 
 
 def spoken(seconds: float) -> str:
@@ -127,4 +148,4 @@ def round_line(check: Any, episodes: int) -> str:
     return f"{head}the safe set holds {100 * check.size:.3g} % of what is not U; {counts}{proof}; {back}: {verdict}"
 
 
-__all__ = ["WORDS", "Progress", "round_line", "spoken"]
+__all__ = ["PROGRESS_FILE", "WORDS", "Progress", "round_line", "spoken"]

@@ -70,7 +70,7 @@ class CheckRound(Phase):
             if work.config.cover_share > 0:
                 found = self._proved(work, held_out, levels) or found
         work.checks.append(found)
-        work.log({"step": self.number, **{k: v for k, v in vars(found).items() if not isinstance(v, str)}})
+        work.log({"step": self.number, **vars(found)})
         # Of the sets that passed, one into which starts in U return counts first, then the largest.
         sound = found.covered >= work.config.cover_share
         rank = [float(sound), float(found.returned >= work.config.return_share), found.size]

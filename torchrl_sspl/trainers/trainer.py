@@ -168,6 +168,7 @@ class SSPLTrainer(Trainer):
         self._log_dict: Any = defaultdict(partial(deque, maxlen=1))  # else all that was ever logged
         self.phases, self.clock, self.show_progress, self.resumed = phases, ClockHook(), progress_bar, False
         self._bar, self._joint = Progress(0, 0, shown=False), False
+        self._out_dir = None if out_dir is None else Path(out_dir)
         self._register(replay_buffer, margins, rollout_policy, None if out_dir is None else Path(out_dir) / LOG_FILE)
         if evaluate is not None:
             EveryHook(self, evaluate, every=evaluate_every).register(self, "evaluate")
@@ -235,7 +236,7 @@ class SSPLTrainer(Trainer):
         self._bar = Progress(
             self._joint_steps() + (0 if self.phases is None else self.phases.steps),
             self._optim_count + (0 if self.phases is None else self.phases.steps_done),
-            shown=self.show_progress, resumed=self.resumed,
+            shown=self.show_progress, resumed=self.resumed, out_dir=self._out_dir,
         )  # fmt: skip
         self._bar.begin("collecting pictures", 0)
         self._joint = False

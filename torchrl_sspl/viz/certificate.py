@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from html import escape
-
 from torchrl_sspl.certification.certificate import PROVED, Certificate, Statement
 from torchrl_sspl.certification.rounding import missed, shown
-from torchrl_sspl.viz.report import badge, table
+from torchrl_sspl.viz.pages import Cell, Table, render
+from torchrl_sspl.viz.report import badge
 
 _TITLES = {
     "run-time": "To how many real episodes the proof applies",
@@ -26,29 +25,26 @@ def certificate_section(certificate: Certificate) -> str:
         >>> "1 &lt; 2" in certificate_section(Certificate("demo", "0" * 64, "0" * 64, 0.0, {"deterministic": layer}))
         True
     """
-    parts = [
-        "<section><h2>Certificate</h2>",
-        f"<p>About the set {{B &le; {certificate.level:g}}} of the agent <b>{escape(certificate.agent)}</b> with "
-        f"weights <code>{escape(certificate.weights[:16])}&hellip;</code>. "
-        "<code>sspl verify</code> computes it again.</p>",
+    layers = [
+        {
+            "title": title,
+            "badge": badge(_SUCCESS[name] if layer.holds else layer.verdict),
+            "table": Table(("Statement", "Status", "Value", "n", "Remark"), [_row(s) for s in layer.statements], ""),
+        }
+        for name, title in _TITLES.items()
+        if (layer := certificate.layers.get(name)) is not None
     ]
-    for name in _TITLES:
-        if name not in certificate.layers:
-            continue
-        layer = certificate.layers[name]
-        parts.append(f"<h3>{_TITLES[name]}</h3><p>{badge(_SUCCESS[name] if layer.holds else layer.verdict)}</p>")
-        parts.append(table(("Statement", "Status", "Value", "n", "Remark"), [_row(s) for s in layer.statements]))
-    return "".join(parts) + "</section>"
+    about = {"level": f"{certificate.level:g}", "agent": certificate.agent, "weights": certificate.weights[:16]}
+    return render("certificate.html", layers=layers, **about)
 
 
-def _row(statement: Statement) -> list[str]:
+def _row(statement: Statement) -> list[str | Cell]:
     s = statement
-    if not s.decides:
-        status = s.kind
-    elif s.holds:
-        status = badge("proved" if s.kind == PROVED else "yes")
-    else:
+    status: str | Cell = s.kind
+    if s.decides and s.holds:
+        status = Cell(badge=badge("proved" if s.kind == PROVED else "yes"))
+    elif s.decides:
         miss = "" if s.misses_by is None else f", misses by {missed(s)}"
-        status = badge(f"not {s.kind}{miss}" if s.kind == PROVED else f"does not hold{miss}")
+        status = Cell(badge=badge(f"not {s.kind}{miss}" if s.kind == PROVED else f"does not hold{miss}"))
     size = "" if s.n is None else f"{s.n:,}" + ("" if s.confidence is None else f", {100 * s.confidence:g} %")
-    return [escape(s.text), status, escape(shown(s)), escape(size), escape(s.detail)]
+    return [s.text, status, shown(s), size, s.detail]

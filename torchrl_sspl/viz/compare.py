@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,18 +14,12 @@ from typing import Any
 from torchrl_sspl.configs.reader import EnvFactory
 from torchrl_sspl.envs.system import Requirement
 from torchrl_sspl.errors import CheckpointError
-from torchrl_sspl.viz.curves import read_log
-from torchrl_sspl.viz.report import badge, bounded, file_uri, format_value, table, verdict_in, write_page
+from torchrl_sspl.files import write
+from torchrl_sspl.viz.curves import COLOURS, panels, read_log
+from torchrl_sspl.viz.pages import Cell, Picture, Table, render
+from torchrl_sspl.viz.report import badge, bounded, file_uri, format_value, verdict_in
 
-_COLOURS = ("#2166ac", "#b2182b", "#1b7837", "#b35806", "#762a83", "#01665e", "#c51b7d", "#4d4d4d")
 _OWN = ("out_dir", "seed", "trainer.progress", "logger.kind", "logger.project")  # no settings of what is compared
-_CSS = """
-.side{display:grid;grid-template-columns:repeat(auto-fill,minmax(min(380px,100%),1fr));gap:14px}.side figure{margin:0}
-.side.small{grid-template-columns:repeat(auto-fill,minmax(230px,1fr))}
-main{max-width:1200px}.curve{width:100%;height:auto}.curve text{font-size:11px;fill:var(--soft)}.curve line{stroke:var(--line)}
-.key i{display:inline-block;width:1em;height:.25em;margin:0 .4em .2em 1em}
-"""
-
 
 @dataclass(frozen=True)
 class Run:
@@ -202,23 +195,17 @@ def compare(runs: Sequence[str | Path] | Sequence[Run], path: str | Path, *, tit
     if not any(run.finished for run in found):
         raise CheckpointError(f"expected at least one run with metrics.json, received {len(found)} directories without")
     rows, keys = rows_of(found), differing(found)
-    required = [r for r in rows if r.must]
-    settings = _settings(found, list(dict.fromkeys(k for run in found for k in run.settings)))
-    parts = [
-        ("Runs", _overview(found)),
-        ("Settings that differ", _settings(found, keys)),
-        ("Requirements", _side(required) + _table(required)),
-        ("Figures", _figures(found)),
-        ("Curves", _curves(found)),
-        ("", f"<details><summary>All measurements</summary>{_table(rows)}</details>"),
-        ("", f"<details><summary>All settings</summary>{settings}</details>"),
-    ]
-    body = "".join(f"<section>{f'<h2>{name}</h2>' if name else ''}{text}</section>" for name, text in parts if text)
-    facts = f"{len(keys)} settings differ, apart from the seed"
-    return write_page(path, title or f"{len(found)} runs", facts, body, _CSS)
+    required, names = [r for r in rows if r.must], list(dict.fromkeys(k for run in found for k in run.settings))
+    page = render(
+        "comparison.html", title=title or f"{len(found)} runs", facts=f"{len(keys)} settings differ, apart from the seed",
+        runs=_overview(found), differing=_settings(found, keys), settings=_settings(found, names), side=_side(required),
+        required=_tables(required), rows=_tables(rows), figures=_figures(found), curves=panels({run.name: _log(run) for run in found}),
+        key=[(k % COLOURS, run.name) for k, run in enumerate(found)],
+    )  # fmt: skip
+    return write(path, page)
 
 
-def _overview(runs: Sequence[Run]) -> str:
+def _overview(runs: Sequence[Run]) -> Table:
     cells = []
     for run in runs:
         m, verdicts = run.metrics, list(run.metrics.get("verdicts", {}).values())
@@ -226,113 +213,59 @@ def _overview(runs: Sequence[Run]) -> str:
         verdict = "not measured" if not verdicts else f"missed {missed} of {len(verdicts)}" if missed else "must"
         seconds = m.get("training_seconds")
         cells.append([
-            f"<code>{escape(run.name)}</code>", escape(_show(run.settings.get("seed"))),
-            "" if seconds is None else f"{seconds / 60:.1f} min",
-            escape(str(m.get("stop_reason", "") if run.finished else "not finished")), badge(verdict),
+            Cell(run.name, "code"), _show(run.settings.get("seed")), "" if seconds is None else f"{seconds / 60:.1f} min",
+            str(m.get("stop_reason", "") if run.finished else "not finished"), Cell(badge=badge(verdict)),
         ])  # fmt: skip
-    return table(["Run", "Seed", "Training", "Why it ended", "Requirements"], cells, kind="plain")
+    return Table(["Run", "Seed", "Training", "Why it ended", "Requirements"], cells)
 
 
-def _table(rows: Sequence[Row]) -> str:
+def _tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
+    """Every setting with its rows."""
     out = []
     for setting, block, names in _blocks(rows):
         cells = []
         for r in block:
-            label, must, mean, worst, verdict = (escape(c) for c in _cells(r))
-            each = [escape(format_value(r.values[n], r.unit)) if n in r.values else "" for n in names]
-            cells.append([label, must, mean, f"<b>{worst}</b>", badge(verdict) if r.must else "", *each])
-        out += [f"<h3>{escape(setting)}</h3>"] if setting else []
-        out.append(table(["Measurement", "Must", "Mean", "Worst", "Verdict of the worst", *names], cells, kind="plain"))
-    return "".join(out)
+            label, must, mean, worst, verdict = _cells(r)
+            each = [format_value(r.values[n], r.unit) if n in r.values else "" for n in names]
+            cells.append([label, must, mean, Cell(worst, "b"), Cell(badge=badge(verdict)) if r.must else "", *each])
+        out.append((setting, Table(["Measurement", "Must", "Mean", "Worst", "Verdict of the worst", *names], cells)))
+    return out
 
 
-def _side(rows: Sequence[Row]) -> str:
+def _side(rows: Sequence[Row]) -> Table | None:
     """The settings beside each other: worst with its verdict, and mean."""
     settings = list(dict.fromkeys(r.setting for r in rows))
     if len(settings) < 2:
-        return ""
+        return None
     places: dict[str, dict[str, Row]] = {}
     for r in rows:
         places.setdefault(r.label, {})[r.setting] = r
     cells = []
     for label, found in places.items():
-        text = {}
+        each: dict[str, Cell] = {}
         for setting, r in found.items():
             _, _, mean, worst, verdict = _cells(r)
-            text[setting] = f"<b>{escape(worst)}</b> {badge(verdict)}<br>mean {escape(mean)}"
+            each[setting] = Cell(worst, "b", badge(verdict), f"mean {mean}")
         must = next((r.must for r in found.values() if r.mean is not None), next(iter(found.values())).must)
-        cells.append([escape(label), escape(must), *(text.get(s, "") for s in settings)])
-    return table(["Worst, verdict and mean", "Must", *settings], cells, kind="plain")
+        cells.append([label, must, *(each.get(s, "") for s in settings)])
+    return Table(["Worst, verdict and mean", "Must", *settings], cells)
 
 
-def _settings(runs: Sequence[Run], keys: Sequence[str]) -> str:
-    cells = [[f"<code>{escape(k)}</code>", *(escape(_show(run.settings.get(k))) for run in runs)] for k in keys]
-    return table(["Key", *(run.name for run in runs)], cells, kind="plain") if keys else ""
+def _settings(runs: Sequence[Run], keys: Sequence[str]) -> Table | None:
+    cells = [[Cell(k, "code"), *(_show(run.settings.get(k)) for run in runs)] for k in keys]
+    return Table(["Key", *(run.name for run in runs)], cells) if keys else None
 
 
-def _figures(runs: Sequence[Run]) -> str:
+def _figures(runs: Sequence[Run]) -> list[tuple[str, list[Picture]]]:
     files = {run.name: {p.name: p for p in sorted((run.directory / "figures").glob("*.png"))} for run in runs}
-    out = []
-    for name in dict.fromkeys(n for found in files.values() for n in found):
-        shown = [
-            f'<figure><img alt="{escape(name)}" src="{file_uri(files[run.name][name])}">'
-            f"<figcaption>{escape(run.name)}</figcaption></figure>"
-            for run in runs
-            if name in files[run.name]
-        ]
-        out.append(f"<h3>{escape(Path(name).stem.replace('_', ' '))}</h3><div class='side'>{''.join(shown)}</div>")
-    return "".join(out)
+    return [
+        (Path(name).stem.replace("_", " "), [Picture(file_uri(found[name]), name, run) for run, found in files.items() if name in found])
+        for name in dict.fromkeys(n for found in files.values() for n in found)
+    ]
 
 
-def _curves(runs: Sequence[Run]) -> str:
-    """Every loss of every phase over its steps, one line per run."""
-    panels: dict[str, dict[str, list[tuple[float, float]]]] = {}
-    for run in runs:
-        for title, point in _points(run):
-            panels.setdefault(title, {}).setdefault(run.name, []).append(point)
-    if not panels:
-        return ""
-    colour = {run.name: _COLOURS[i % len(_COLOURS)] for i, run in enumerate(runs)}
-    key = "".join(f'<i style="background:{c}"></i>{escape(n)}' for n, c in colour.items())
-    drawn = "".join(_panel(title, lines, colour) for title, lines in panels.items())
-    return f"<p class='key'>{key}</p><div class='side small'>{drawn}</div>"
-
-
-def _points(run: Run) -> Iterator[tuple[str, tuple[float, float]]]:
+def _log(run: Run) -> list[dict[str, Any]]:
     try:
-        log = read_log(run.directory / "log.jsonl")
+        return read_log(run.directory / "log.jsonl")
     except CheckpointError:
-        return
-    longest: dict[str, int] = {}
-    for row in log:
-        longest[row["phase"]] = max(longest.get(row["phase"], 1), row["step"])
-    for row in log:  # rounds follow each other on the axis
-        x = row["round"] * longest[row["phase"]] + row["step"]
-        for name, value in row.items():
-            if name.startswith("loss") and isinstance(value, (int, float)) and math.isfinite(value):
-                yield f"{row['phase']}: {name.removeprefix('loss_').replace('_', ' ')}", (float(x), float(value))
-
-
-def _panel(title: str, lines: Mapping[str, list[tuple[float, float]]], colour: Mapping[str, str]) -> str:
-    points = [p for line in lines.values() for p in line]
-    log = min(y for _, y in points) > 0
-
-    def height(y: float) -> float:
-        return math.log10(y) if log else y
-
-    left, right = min(x for x, _ in points), max(x for x, _ in points)
-    low, high = height(min(y for _, y in points)), height(max(y for _, y in points))
-
-    def place(x: float, y: float) -> str:
-        across = 40 + 250 * (x - left) / ((right - left) or 1)
-        return f"{across:.1f},{130 - 110 * (height(y) - low) / ((high - low) or 1):.1f}"
-
-    drawn = ""
-    for name, line in lines.items():
-        path = " ".join(place(*p) for p in line[:: len(line) // 400 + 1])
-        drawn += f'<polyline fill="none" stroke-width="1.5" stroke="{colour[name]}" points="{path}"/>'
-    bottom, top = (10**v if log else v for v in (low, high))
-    texts = [(40, 12, escape(title)), (0, 134, f"{bottom:.2g}"), (0, 24, f"{top:.2g}"), (265, 148, f"{right:g}")]
-    head, *marks = (f'<text x="{x}" y="{y}">{text}</text>' for x, y, text in texts)
-    axes = '<line x1="40" y1="130" x2="290" y2="130"/><line x1="40" y1="20" x2="40" y2="130"/>'
-    return f'<svg class="curve" viewBox="0 0 300 152" role="img">{head}{axes}{"".join(marks)}{drawn}</svg>'
+        return []

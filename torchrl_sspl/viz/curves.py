@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +17,8 @@ from torchrl_sspl.viz.plane import PATH_COLOURS, new_figure
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+COLOURS = 8  # of curves, in the style sheet
 
 
 def read_log(path: str | Path) -> list[dict[str, Any]]:
@@ -40,6 +44,64 @@ def read_log(path: str | Path) -> list[dict[str, Any]]:
     if not rows:
         raise CheckpointError(f"expected at least one row in '{path}', received an empty log.")
     return rows
+
+
+@dataclass(frozen=True)
+class Panel:
+    """Curves of one loss of one phase, as a page draws them: 250 x 110 pixels from (40, 20) on."""
+
+    title: str
+    lines: list[tuple[int, str]]  # number of a colour of the style sheet, points
+    bottom: str  # value below ...
+    top: str  # ... and above
+    end: str  # last step
+
+
+def panels(logs: Mapping[str, Sequence[Mapping[str, Any]]]) -> list[Panel]:
+    """Every loss of every phase over its steps, a line for every log; rounds follow each other.
+
+    ``logs``: rows by the name of their run, see :func:`read_log`. Source: none.
+
+    Example:
+        >>> found = panels({"run": [{"phase": "fit", "round": 0, "step": s, "loss_safe": 1 / s} for s in (100, 200)]})
+        >>> [(p.title, p.bottom, p.top, p.end, p.lines) for p in found]
+        [('fit: safe', '0.005', '0.01', '200', [(0, '40.0,20.0 290.0,130.0')])]
+    """
+    found: dict[str, dict[int, list[tuple[float, float]]]] = {}
+    for k, log in enumerate(logs.values()):
+        for title, point in _points(log):
+            found.setdefault(title, {}).setdefault(k, []).append(point)
+    return [_panel(title, lines) for title, lines in found.items()]
+
+
+def _points(log: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, tuple[float, float]]]:
+    longest: dict[str, int] = {}
+    for row in log:
+        longest[row["phase"]] = max(longest.get(row["phase"], 1), row["step"])
+    for row in log:
+        x = row["round"] * longest[row["phase"]] + row["step"]
+        for name, value in row.items():
+            if name.startswith("loss") and isinstance(value, (int, float)) and math.isfinite(value):
+                yield f"{row['phase']}: {name.removeprefix('loss_').replace('_', ' ')}", (float(x), float(value))
+
+
+def _panel(title: str, lines: Mapping[int, list[tuple[float, float]]]) -> Panel:
+    points = [p for line in lines.values() for p in line]
+    log = min(y for _, y in points) > 0
+
+    def height(y: float) -> float:
+        return math.log10(y) if log else y
+
+    left, right = min(x for x, _ in points), max(x for x, _ in points)
+    low, high = height(min(y for _, y in points)), height(max(y for _, y in points))
+
+    def place(x: float, y: float) -> str:
+        across = 40 + 250 * (x - left) / ((right - left) or 1)
+        return f"{across:.1f},{130 - 110 * (height(y) - low) / ((high - low) or 1):.1f}"
+
+    drawn = [(k % COLOURS, " ".join(place(*p) for p in line[:: len(line) // 400 + 1])) for k, line in lines.items()]
+    bottom, top = (f"{10**v if log else v:.2g}" for v in (low, high))
+    return Panel(title, drawn, bottom, top, f"{right:g}")
 
 
 def training_curves(path: str | Path) -> Figure:

@@ -3,18 +3,13 @@
 from __future__ import annotations
 
 import base64
-import errno
-import html
 import io
 import itertools
-import json
 import math
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import closing, nullcontext
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -35,12 +30,13 @@ from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
 from torchrl_sspl.runtime.monitor import starts
 from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.viz.animation import HEIGHT, WIDTH, mp4_writer
-from torchrl_sspl.viz.live_page import PAGE
+from torchrl_sspl.viz.pages import render
 from torchrl_sspl.viz.plane import require
+from torchrl_sspl.viz.server import Feed, served
+from torchrl_sspl.viz.training import training_directory, watch_training
 
 POLICIES = ("own", "random")
 PHYSICS = "physics"
-_KEPT = 300  # steps that whoever opens the page is shown at once
 _STARTS, _HORIZON, _HELD = 32, 200, 0.2  # starts that are taken in turn, longest episode, chance of a new random action
 #: What verdicts are called, and their colours in a film.
 VERDICTS = {
@@ -73,10 +69,12 @@ def watch(
 ) -> dict[str, int]:
     """Runs an agent behind its monitor, and shows it on a page until the steps are over or it is interrupted.
 
-    Episodes begin in {B <= 0} where the system's states are known. Whoever reaches ``host`` and ``port`` can see the page. Source: none.
+    The directory of a run that is being trained, or has no calibrated agent, shows its training instead: phase, losses, volume kept
+    so far, held-out checks, time left. Episodes begin in {B <= 0} where the system's states are known. Whoever reaches ``host`` and
+    ``port`` can see the page. Source: none.
 
     Args:
-        name: shipped agent, or run directory with a calibration.
+        name: shipped agent, run directory with a calibration, or that of a training.
         env: a system as in ``sspl train env=...``, or ``"physics"``: the agent's own one in full physics; default: the agent's own one.
         video: film file in place of a system; nothing can be done there, so that what happens is not
             what the agent expects of its own actions.
@@ -84,17 +82,25 @@ def watch(
         protect: put the safety filter behind the policy; the margin of an agent without a proof is .02.
         record: an .mp4 file to write.
         host, port: where the page is served; port 0: any that is free.
-        steps: after so many it ends; None: it goes on.
+        steps: after so many (of a training: changes that were shown) it ends; None: it goes on.
         fps: steps per second; None: as fast as the system itself, or the film; ``inf``: as fast as possible.
         noise: of the camera of a system, standard deviation in grey levels; shipped calibrations suppose one.
         seed: of all that is drawn.
         ready: called with the page's address.
 
-    Returns how many ``steps``, ``interventions``, ``alarms`` (steps) and ``entered`` (episodes into U) there were. Raises ConfigError for
-    arguments that are not valid, a port that is taken or a film that cannot be read; CheckpointError without a calibration;
-    MissingDependencyError without the extra ``viz``.
+    Returns how many ``steps``, ``interventions``, ``alarms`` (steps) and ``entered`` (episodes into U) there were; of a training how
+    many ``changes`` and ``rounds``. Raises ConfigError for arguments that are not valid, a port that is taken or a film that cannot be
+    read; CheckpointError without a calibration and without a log; MissingDependencyError without the extra ``viz``.
     """
     _check(env, video, policy, protect, record, port, steps, fps, noise)
+    training = training_directory(name)
+    if training is not None:
+        if env is not None or video is not None or policy != "own" or protect or record is not None:
+            raise ConfigError(
+                f"expected no env, video, policy, filter or record with a training, received one; '{training}' has no calibrated agent that "
+                "could act yet: `sspl calibrate` makes one of a run that has ended"
+            )
+        return watch_training(training, host=host, port=port, changes=steps, ready=ready)
     monitor = Monitor.load(name)
     agent = monitor.agent
     shield = Shield(agent, margin=None if agent.tolerated_error > 0.0 else UNPROVED_MARGIN) if protect else None
@@ -104,8 +110,7 @@ def watch(
         run, pace = _of_film(Path(video), _size(agent))
     where = "a film" if video is not None else {None: "its own system", PHYSICS: "full physics"}.get(env, env)
     about = f"{where}; {'random actions' if policy == 'random' else 'its own actions'}; safety filter {'on' if protect else 'off'}"
-    feed = Feed()
-    server = _serve(host, port, feed, PAGE.replace("{{name}}", html.escape(name)).replace("{{about}}", html.escape(about)))
+    feed, page = Feed(), render("watch.html", title=name, facts=about)
     film, period, due = None, 1.0 / (fps or pace), time.monotonic()
 
     def show(event: dict[str, Any], frame: NDArray[np.uint8]) -> None:
@@ -119,16 +124,14 @@ def watch(
     camera = CameraFault("dark", 1.0, noise=noise if video is None else 0.0, seed=seed)
     view = _View(monitor, shield, camera, show, steps, random=policy == "random", seed=seed)
     try:
-        film = None if record is None else _Film(Path(record), min(fps or pace, 60.0), f"{name}: {about}")
-        ready(f"http://{host}:{server.server_address[1]}/")
-        due = time.monotonic()
-        run(view)
+        with served(host, port, feed, lambda: page) as address:
+            film = None if record is None else _Film(Path(record), min(fps or pace, 60.0), f"{name}: {about}")
+            ready(address)
+            due = time.monotonic()
+            run(view)
     except (_Over, KeyboardInterrupt):
         pass
     finally:
-        feed.close()
-        server.shutdown()
-        server.server_close()
         if film is not None:
             film.close()
     return view.counts
@@ -304,97 +307,6 @@ def _number(value: Tensor) -> float | None:
     return round(number, 5) if math.isfinite(number) else None
 
 
-class Feed:
-    """What happened last, for any number of readers, each at its own pace. Source: none.
-
-    Example:
-        >>> feed = Feed()
-        >>> feed.publish({"step": 1}, "data:,")
-        >>> feed.close()
-        >>> list(feed.events())
-        [{'step': 1, 'picture': 'data:,'}]
-    """
-
-    def __init__(self) -> None:
-        self._changed, self._open = threading.Condition(), True
-        self._recent: deque[dict[str, Any]] = deque(maxlen=_KEPT)
-        self._count, self._picture = 0, ""
-
-    def publish(self, event: dict[str, Any], picture: str) -> None:
-        """One more event, and the picture that belongs to it."""
-        with self._changed:
-            self._recent.append(event)
-            self._picture = picture
-            self._count += 1
-            self._changed.notify_all()
-
-    def close(self) -> None:
-        """Readers come to an end."""
-        with self._changed:
-            self._open = False
-            self._changed.notify_all()
-
-    def events(self) -> Iterator[dict[str, Any]]:
-        """Events still kept, then those that come, the newest with its picture; who is too slow misses some."""
-        read = 0
-        while True:
-            with self._changed:
-                while self._count == read and self._open:
-                    self._changed.wait()
-                new = list(self._recent)[-(self._count - read) :] if self._count > read else []
-                read, ended, picture = self._count, not self._open, self._picture
-            yield from new[:-1]
-            yield from [event | {"picture": picture} for event in new[-1:]]
-            if ended:
-                return
-
-
-def _serve(host: str, port: int, feed: Feed, page: str) -> ThreadingHTTPServer:
-    """A server of the page in threads of its own."""
-
-    class Handler(BaseHTTPRequestHandler):
-        def do_GET(self) -> None:
-            if self.path == "/":
-                self._answer(200, "text/html; charset=utf-8", page.encode())
-            elif self.path == "/events":
-                self._stream()
-            else:
-                self._answer(404, "text/plain; charset=utf-8", b"not here\n")
-
-        def _answer(self, status: int, kind: str, body: bytes) -> None:
-            self.send_response(status)
-            self.send_header("Content-Type", kind)
-            self.send_header("Content-Length", str(len(body)))
-            self.send_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'; script-src 'unsafe-inline'; "
-                             "img-src data:; connect-src 'self'")  # fmt: skip
-            self.end_headers()
-            self.wfile.write(body)
-
-        def _stream(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "text/event-stream")
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            try:
-                for event in feed.events():
-                    self.wfile.write(f"data: {json.dumps(event)}\n\n".encode())
-                self.wfile.write(b"event: end\ndata: {}\n\n")
-            except OSError:
-                pass  # whoever looked has gone
-
-        def log_message(self, *arguments: Any) -> None:
-            """Nothing: the terminal is not for that."""
-
-    try:
-        server = ThreadingHTTPServer((host, port), Handler)
-    except OSError as error:
-        why = "which is taken" if error.errno == errno.EADDRINUSE else f"which cannot be used ({error})"
-        raise ConfigError(f"expected a free port, received {host}:{port}, {why}; choose another with --port, 0 takes any") from error
-    server.daemon_threads = True
-    threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True).start()
-    return server
-
-
 def picture_data(frame: NDArray[np.uint8]) -> str:
     """A frame ``(H, W, 3)`` uint8 as an address that a page can show. Source: none."""
     file = io.BytesIO()
@@ -454,4 +366,4 @@ class _Film:
         self.writer.close()
 
 
-__all__ = ["POLICIES", "Feed", "picture_data", "watch"]
+__all__ = ["POLICIES", "picture_data", "watch"]

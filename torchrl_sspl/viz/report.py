@@ -9,14 +9,13 @@ import platform
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, is_dataclass
-from html import escape
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.files import write
-from torchrl_sspl.viz.report_style import CSS, SETS, picture
+from torchrl_sspl.viz.pages import Badge, Cell, Picture, Table, render
 
 _NOT_MEASURED = "not measured"
 _MIME = {
@@ -92,16 +91,6 @@ def _count(value: Any) -> str:
     return "\u2013" if value is None else format_value(value)
 
 
-def table(head: Sequence[str], rows: Sequence[Sequence[str]], *, kind: str = "") -> str:
-    """A table as HTML, of cells that are HTML already; every cell knows its column, so that a phone can stack them."""
-    top = "".join(f'<th scope="col">{escape(h)}</th>' for h in head)
-    body = "".join(
-        "<tr>" + "".join(f'<td data-label="{escape(h)}">{c}</td>' for h, c in zip(head, row, strict=True)) + "</tr>"
-        for row in rows
-    )
-    return f'<div class="scroll"><table class="{kind}"><thead><tr>{top}</tr></thead><tbody>{body}</tbody></table></div>'
-
-
 def verdict_kind(verdict: str) -> str:
     """Class of a verdict: "good", "fair" (seen, not certain), "bad" or "none"."""
     text = str(verdict).strip().lower()
@@ -117,11 +106,10 @@ _BADGES = {"good": "\u2713", "fair": "\u2248", "bad": "\u2717", "none": "?"}
 _WORDS = {"aim": "aim reached", "must": "must reached"}
 
 
-def badge(verdict: str) -> str:
-    """A verdict ("aim", "must", "proved", "yes", "pass": good; see ``bounded``: fair; "not measured"; else bad) as a mark in HTML."""
+def badge(verdict: str) -> Badge:
+    """A verdict ("aim", "must", "proved", "yes", "pass": good; see ``bounded``: fair; "not measured"; else bad) as a mark."""
     kind = verdict_kind(verdict)
-    text = _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or _NOT_MEASURED)
-    return f'<span class="badge {kind}">{_BADGES[kind]}&nbsp;{escape(text)}</span>'
+    return Badge(kind, _BADGES[kind], _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or _NOT_MEASURED))
 
 
 def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple[str, Any, str, str, str]]:
@@ -178,7 +166,7 @@ def verdict_in(unit: str, verdict: str) -> str:
     return f"missed by {format_value(float(verdict.removeprefix('missed by ')), unit)}"
 
 
-def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> tuple[str, str, str]:
+def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> tuple[str, str, Table | None]:
     """Headline, its class, and the table with must and aim."""
     kinds, out = [], []
     for row in rows:
@@ -190,8 +178,8 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
         if shown == _NOT_MEASURED:
             verdict = _NOT_MEASURED
         kinds.append(verdict_kind(verdict))
-        numbers = (escape(text) for text in (_bound(m), _count(m.get("n")), format_value(must), format_value(aim)))
-        out.append([escape(str(label)), f"<b>{escape(shown)}</b>", *numbers, badge(verdict)])
+        numbers = (_bound(m), _count(m.get("n")), format_value(must), format_value(aim))
+        out.append([str(label), Cell(shown, "b"), *numbers, Cell(badge=badge(verdict))])
     aims, missed, unknown = (kinds.count(kind) for kind in ("good", "bad", "none"))
     fair = kinds.count("fair")
     reached, aims = aims, sum(str(row[4]).startswith("aim") for row, kind in zip(rows, kinds, strict=True) if kind == "good")
@@ -208,7 +196,7 @@ def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str,
     if reached:
         headline += f", {aims} at the aim" if not missed else f", {reached} reached"
     head = ("Requirement", "Measured", "95 % bound", "n", "Must", "Aim", "Verdict")
-    return headline, kind, table(head, out, kind="summary") if rows else ""
+    return headline, kind, Table(head, out, "summary") if rows else None
 
 
 def _data_uri(data: bytes, mime: str) -> str:
@@ -226,22 +214,13 @@ def file_uri(path: str | Path) -> str:
     return _data_uri(path.read_bytes(), mime)
 
 
-def _shown(uri: str, alt: str, caption: str, poster: str = "") -> str:
-    """A picture or film with its caption, which is HTML already; ``poster``: what is shown before the film begins."""
-    media = f'<label class="zoom"><input type="checkbox" aria-label="full size"><span><img alt="{escape(alt)}" src="{uri}"></span></label>'
-    if uri.startswith("data:video/"):
-        shown = f' poster="{poster}"' if poster else ""
-        media = f'<video controls loop muted playsinline preload="metadata"{shown} src="{uri}"></video>'
-    return f"<figure>{media}<figcaption>{caption}</figcaption></figure>"
-
-
-def _film(path: Path, caption: str) -> str:
+def _film(path: Path, caption: str) -> Picture:
     """A film; a picture beside it of the same name, ending in .jpg, is shown before it begins."""
     poster = path.with_suffix(".jpg")
-    return _shown(file_uri(path), caption, escape(caption), file_uri(poster) if poster.is_file() else "")
+    return Picture(file_uri(path), caption, caption, poster=file_uri(poster) if poster.is_file() else "")
 
 
-def _figure(name: str, value: Any) -> str:
+def _figure(name: str, value: Any) -> Picture:
     """One figure: a matplotlib Figure (its label is the caption), a path, or a pair (either, caption)."""
     caption = ""
     if isinstance(value, tuple) and len(value) == 2:
@@ -257,7 +236,7 @@ def _figure(name: str, value: Any) -> str:
         raise ConfigError(
             f"figures[{name!r}]: expected a matplotlib Figure or a path, received {type(value).__name__}."
         )
-    return _shown(uri, caption or name, f"<b>{escape(name)}.</b> {escape(caption)}")
+    return Picture(uri, caption or name, caption, name)
 
 
 def _flatten(config: Mapping[str, Any], prefix: str = "") -> list[tuple[str, Any]]:
@@ -290,12 +269,12 @@ def _resolve(label: str, value: Any, measurements: Mapping[str, dict[str, Any]])
     return m.get("value"), m
 
 
-def _sizes(checks: Sequence[Any]) -> str:
+def _sizes(checks: Sequence[Any]) -> Table:
     rows = [_plain("checks", c) for c in checks]
     names = list(dict.fromkeys(k for row in rows for k in row))
     share = ("size", "returned")
-    cells = [[escape(format_value(r.get(k), "share" if k in share else "")) for k in names] for r in rows]
-    return table([n.replace("_", " ") for n in names], cells, kind="plain")
+    cells = [[format_value(r.get(k), "share" if k in share else "") for k in names] for r in rows]
+    return Table([n.replace("_", " ") for n in names], cells)
 
 
 def write_report(
@@ -353,54 +332,32 @@ def write_report(
     """
     data = {name: _plain(f"measurements[{name!r}]", m) for name, m in (measurements or {}).items()}
     config = dict(config or {})
-    first, kind, rows_of_summary = _summary(summary, data)
+    first, kind, requirements = _summary(summary, data)
     more = ""
     if headline is not None:
         first, kind, more = headline
     lists = (proved, measured or _measured_lines(summary, data), _ASSUMED if assumed is None else assumed)
-    parts = [
-        _verdict(first, kind, more, lists, kernel),
-        _section("Film", "" if video is None else _film(Path(video), video_caption)),
-        _section("Requirements", rows_of_summary),
-        certificate or "",
-        _section("Notes", _paragraphs(notes)),
-        _section("Figures", "".join(_figure(n, f) for n, f in (figures or {}).items())),
-        _section("Held-out checks of every round", _sizes(checks) if checks else ""),
-        _measurements(data) if data else "",
-        _configuration(config) if config else "",
-    ]
-    return write_page(path, title, " / ".join(_facts(config)), "".join(parts))
-
-
-def write_page(path: str | Path, title: str, facts: str, body: str, css: str = "") -> Path:
-    """Write, whole or not at all, a page with a title, a line of facts, a body that is HTML, and further styles."""
-    page = (
-        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        '<meta name="color-scheme" content="light dark">'
-        f"<title>{escape(title)}</title><style>{CSS}{css}</style></head><body><main><header><h1>{escape(title)}</h1>"
-        f"<p class='facts'>{escape(facts)}</p></header>{body}</main></body></html>\n"
-    )
+    page = render(
+        "report.html", title=title, facts=" / ".join(_facts(config)), headline=first, kind=kind, mark=_BADGES[kind], more=more,
+        columns=_columns(lists), kernel=kernel, film=None if video is None else _film(Path(video), video_caption),
+        requirements=requirements, certificate=certificate or "", notes=_paragraphs(notes),
+        figures=[_figure(n, f) for n, f in (figures or {}).items()], checks=_sizes(checks) if checks else None,
+        measurements=_measurements(data) if data else None, configuration=_configuration(config) if config else None,
+    )  # fmt: skip
     return write(path, page)
 
 
-def _verdict(text: str, kind: str, more: str, lists: Sequence[Sequence[str | tuple[str, str]]], kernel: bool) -> str:
-    """The head of the page: the verdict, what is proved, measured and assumed, and what S, U and B are."""
+def _columns(lists: Sequence[Sequence[str | tuple[str, str]]]) -> list[tuple[str, list[Badge]]]:
+    """What is proved, measured and assumed."""
     empty = ("Nothing is claimed as proved.", "No share with a confidence bound.", "Nothing stated.")
     columns = zip(("Proved", "Measured", "Assumed"), lists, empty, strict=True)
-    cells = "".join(f"<div><h3>{name}</h3><ul>{''.join(map(_item, items or [none]))}</ul></div>" for name, items, none in columns)
-    names = [name for name in SETS if kernel or name != "true kernel"]
-    terms = "".join(f"<dt>{escape(name)}</dt><dd>{escape(SETS[name])}</dd>" for name in names)
-    sets = f'<div class="sets">{picture(kernel)}<dl>{terms}</dl></div>'
-    head = f"<h2>{_BADGES[kind]} {escape(text)}</h2>" + (f"<p>{escape(more)}</p>" if more else "")
-    return f'<section class="verdict {kind}">{head}<div class="columns">{cells}</div>{sets}</section>'
+    return [(name, [item(i) for i in items or [none]]) for name, items, none in columns]
 
 
-def _item(item: str | tuple[str, str]) -> str:
+def item(given: str | tuple[str, str]) -> Badge:
     """A sentence, with the mark of its kind where it has one."""
-    kind, text = ("none", item) if isinstance(item, str) else item
-    mark = "" if kind == "none" else f"<b>{_BADGES[kind]}</b> "
-    return f'<li class="{kind}">{mark}{escape(str(text))}</li>'
+    kind, text = ("none", given) if isinstance(given, str) else given
+    return Badge(kind, "" if kind == "none" else _BADGES[kind], str(text))
 
 
 def _facts(config: Mapping[str, Any]) -> list[str]:
@@ -410,30 +367,21 @@ def _facts(config: Mapping[str, Any]) -> list[str]:
     return [*chosen, *versions, f"Python {platform.python_version()}"]
 
 
-def _section(title: str, body: str) -> str:
-    return f"<section><h2>{title}</h2>{body}</section>" if body else ""
+def _paragraphs(notes: str) -> list[str]:
+    return [p.strip() for p in re.split(r"\n\s*\n", notes) if p.strip()]
 
 
-def _paragraphs(notes: str) -> str:
-    found = (p.strip() for p in re.split(r"\n\s*\n", notes))
-    return "".join(f"<p>{escape(p)}</p>".replace("\n", "<br>") for p in found if p)
-
-
-def _measurements(data: Mapping[str, dict[str, Any]]) -> str:
+def _measurements(data: Mapping[str, dict[str, Any]]) -> Table:
     """Every measurement with its bound, size and how it was made."""
-    cells = []
-    for name, m in data.items():
-        value, n = format_value(m.get("value"), m.get("unit", "")), _count(m.get("n"))
-        texts = (escape(text) for text in (value, _bound(m), n, str(m.get("note", ""))))
-        cells.append([f"<code>{escape(name)}</code>", *texts])
-    body = table(("Measurement", "Value", "95 % bound", "n", "How"), cells, kind="plain")
-    return f"<section><details><summary>All {len(data)} measurements</summary>{body}</details></section>"
+    rows = [
+        [Cell(name, "code"), format_value(m.get("value"), m.get("unit", "")), _bound(m), _count(m.get("n")), str(m.get("note", ""))]
+        for name, m in data.items()
+    ]
+    return Table(("Measurement", "Value", "95 % bound", "n", "How"), rows)
 
 
-def _configuration(config: Mapping[str, Any]) -> str:
-    rows = [[f"<code>{escape(k)}</code>", escape(str(v))] for k, v in _flatten(config)]
-    body = table(("Key", "Value"), rows, kind="plain")
-    return f"<section><details><summary>Configuration</summary>{body}</details></section>"
+def _configuration(config: Mapping[str, Any]) -> Table:
+    return Table(("Key", "Value"), [[Cell(k, "code"), str(v)] for k, v in _flatten(config)])
 
 
 def _version(package: str) -> str:
