@@ -10,8 +10,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
-from torchrl_sspl.data import collect
+from torchrl_sspl.data import TransitionStore, collect, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError

@@ -9,6 +9,7 @@ import functools
 import multiprocessing.util
 import os
 import shutil
+import signal
 import tempfile
 import warnings
 import weakref
@@ -285,7 +286,8 @@ def make_collector(
         _shorten_sockets()
         collector = Collector(
             makers, copied, backend="process", sync=True, cat_results="stack", auto_register_policy_transforms=False,
-            **options,
+            # Control-C reaches workers too: without them the trainer could not save its state.
+            init_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_IGN), **options,
         )  # fmt: skip
     else:
         collector = _ray_collector(makers, copied, ray_address, options)
@@ -297,7 +299,7 @@ def _shorten_sockets() -> None:
     """Lets this process and its workers keep their sockets elsewhere where ``TMPDIR`` is too long for the name of one.
 
     Workers hand over tensors through them. Of a batch that cannot be handed over nobody tells the collector, which waits for it
-    for ever (https://github.com/python/cpython/issues/132124; mended in Python 3.14).
+    for ever (https://github.com/python/cpython/issues/132124; newer versions of Python mend it).
     """
     longest = _SOCKET - len("/listener-01234567")
     if os.name == "nt" or len(os.fsencode(multiprocessing.util.get_temp_dir())) <= longest:
