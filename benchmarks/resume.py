@@ -1,7 +1,8 @@
-"""Kills a training with SIGKILL at random moments of all its phases, resumes it, and compares it with one that nobody killed.
+"""Kills or interrupts a training at random moments of all its phases, resumes it, and compares it with one that nobody touched.
 
-Run: python benchmarks/resume.py env=pendulum [kills=20] [runs=1] [kill_seed=0] [folder=runs/resume] [key=value ...]
+Run: python benchmarks/resume.py env=pendulum [kills=20] [signal=KILL] [runs=1] [kill_seed=0] [folder=runs/resume] [key=value ...]
 
+`signal=INT` and `signal=TERM` have to end it with code 130 or 143, no traceback, and one line that says where the state is.
 The kills are spread over `runs` trainings, each compared at its end, bit for bit: weights, log, held-out checks and budget.
 Every phase is struck once before one is struck twice. `key=value` go to the training, which is that of `preset=smoke`.
 Exits with 1 if anything differs.
@@ -62,7 +63,10 @@ class Training:
         environment = os.environ | {"TQDM_MININTERVAL": "0.02", "PYTHONUNBUFFERED": "1", "PYTHONWARNINGS": "ignore"}
         command = [sys.executable, "-m", "torchrl_sspl", "train", *words, f"out_dir={folder}"]
         self.began, self.seen = time.monotonic(), Seen()
-        self.process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment)
+        self.process = subprocess.Popen(
+            command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background of a shell it is ignored
+        )  # fmt: skip
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
 
@@ -83,8 +87,8 @@ class Training:
             raise SystemExit(f"the training ended with code {code}:\n{self.seen.text[-3000:]}")
         return self.seen
 
-    def kill_at(self, phases: list[str], phase: str, step: int, delay: float) -> bool:
-        """Kill it a while after a step of a phase is reached; whether it was still running."""
+    def kill_at(self, phases: list[str], phase: str, step: int, delay: float, number: signal.Signals) -> bool:
+        """Send it a signal a while after a step of a phase is reached; whether it was still running."""
         place = phases.index(phase), step
         while self.process.poll() is None:
             at, k = self.seen.now
@@ -94,10 +98,19 @@ class Training:
             time.sleep(0.002)
         running = self.process.poll() is None
         if running:
-            os.kill(self.process.pid, signal.SIGKILL)
+            os.kill(self.process.pid, number)
         self.process.wait()
         self._reader.join()
         return running
+
+    def wrong(self, number: signal.Signals, folder: Path) -> str:
+        """What is wrong with its end by a signal; SIGKILL cannot be answered."""
+        if number == signal.SIGKILL:
+            return ""
+        said = re.findall(r"^interrupted by .*$", self.seen.text, re.MULTILINE)
+        if self.process.returncode == 128 + number and "Traceback" not in self.seen.text and len(said) == 1 and str(folder) in said[0]:
+            return ""
+        return f"; WRONG END: code {self.process.returncode}, said {said}, then {self.seen.text[-1500:]!r}"
 
 
 PHASES = ("joint", "gather", "dynamics", "teach", "fit", "steer", "tune", "check", "level")
@@ -129,12 +142,13 @@ def differences(one: Path, other: Path) -> list[str]:
 
 def main(words: list[str]) -> int:
     """Run it."""
-    own = {"kills": "20", "runs": "1", "kill_seed": "0", "folder": "runs/resume"}
+    own = {"kills": "20", "signal": "KILL", "runs": "1", "kill_seed": "0", "folder": "runs/resume"}
     for word in list(words):
         key, _, value = word.partition("=")
         if key in own:
             own[key] = value
             words.remove(word)
+    number = signal.Signals[f"SIG{own['signal'].removeprefix('SIG')}"]
     folder, kills, runs, draw = Path(own["folder"]), int(own["kills"]), int(own["runs"]), random.Random(int(own["kill_seed"]))
     systems = [w for w in words if w.startswith("env=")]
     settings = [*systems, *FAST, *(w for w in words if w not in systems)]
@@ -142,26 +156,27 @@ def main(words: list[str]) -> int:
         shutil.rmtree(folder)
     whole = Training(settings, folder / "whole").finish()
     print(f"not interrupted: {len(whole.phases)} phases ({', '.join(whole.phases)}), {max(whole.times.values()):.0f} s", flush=True)
-    plan, equal, struck = moments(whole, kills, draw), 0, 0
+    plan, equal, struck, bad = moments(whole, kills, draw), 0, 0, 0
     for run in range(runs):
         place, mine = folder / f"killed{run}", plan[run::runs]
         hit = 0
         for phase, step, delay in mine:
             training = Training(settings, place)
-            running = training.kill_at(whole.phases, phase, step, delay)
-            hit, struck = hit + running, struck + running
+            running = training.kill_at(whole.phases, phase, step, delay, number)
+            wrong = training.wrong(number, place) if running else ""
+            hit, struck, bad = hit + running, struck + running, bad + bool(wrong)
             at, k = training.seen.now
             began = "resumed" if training.seen.resumed else "from the start"
-            text = f"in {at}, step {k}, {began}" if running else f"it had ended before {phase}, step {step}"
-            print(f"kill {struck:>2}: {text}" if running else f"no kill: {text}", flush=True)
+            text = f"in {at}, step {k}, {began}{wrong}" if running else f"it had ended before {phase}, step {step}"
+            print(f"{number.name} {struck:>2}: {text}" if running else f"no {number.name}: {text}", flush=True)
         seen = Training(settings, place).finish()
         found = differences(folder / "whole", place)
         equal += 0 if found else hit
         print(f"run {run}: finished ({'resumed' if seen.resumed else 'from the start'}); " + (
             f"DIFFERS in {', '.join(found)}" if found else "weights, log, checks and budget are those of the uninterrupted run, bit for bit"
         ), flush=True)  # fmt: skip
-    print(f"{equal} of {kills}")
-    return int(equal != kills)
+    print(f"{equal} of {kills} resumed to the same end, {struck - bad} of {kills} ended as they have to")
+    return int(equal != kills or struck - bad != kills)
 
 
 if __name__ == "__main__":

@@ -117,6 +117,19 @@ def test_where_nobody_saves_in_time_it_ends_all_the_same(monkeypatch):
     assert time.monotonic() - begun < 10
 
 
+def test_what_fails_before_its_state_is_saved_is_not_ended_once_more_later(monkeypatch):
+    monkeypatch.setattr(interrupts, "PATIENCE", 0.3)
+
+    def work():
+        with interruptible(), saving():
+            signal.raise_signal(signal.SIGINT)
+            raise OSError("full")
+
+    with pytest.raises(OSError, match="full"):
+        work()
+    time.sleep(0.6)  # else a KeyboardInterrupt comes here
+
+
 def test_handlers_are_those_from_before_afterwards_and_a_programs_own_are_kept():
     def own(number, frame):
         seen.append(number)

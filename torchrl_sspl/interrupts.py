@@ -91,6 +91,8 @@ def interruptible(say: Callable[[], str] = lambda: "nothing was to be saved") ->
             signal.signal(number, _watch)
         yield
     finally:
+        if _watch.timer is not None:  # what it was to end has failed of itself: it would end what comes afterwards
+            _watch.timer.cancel()
         _watch = None
         for number in ours:
             default = signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import tempfile
+from multiprocessing import connection, current_process, util
+
 import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 
-from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
+from torchrl_sspl.data import TransitionStore, collect, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
@@ -156,3 +159,44 @@ def test_random_actions_go_on_where_they_were(env, before):
     other.load_state_dict(policy.state_dict())
     assert torch.equal(draw(policy), draw(other))
     assert torch.equal(draw(policy), draw(other))
+
+
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """A function that moves temporary files into a folder whose name has so many bytes more."""
+
+    def move(longer):
+        folder = tmp_path.joinpath(*["x" * 50] * (longer // 50))
+        folder.mkdir(parents=True, exist_ok=True)
+        monkeypatch.setattr(tempfile, "tempdir", str(folder))
+        return folder
+
+    monkeypatch.delitem(current_process()._config, "tempdir", raising=False)
+    monkeypatch.setitem(current_process()._config, "tempdir", None)  # so that it is put back afterwards
+    return move
+
+
+def test_sockets_have_names_that_fit_however_long_the_folder_of_temporary_files(temporary):
+    temporary(150)
+    collect._shorten_sockets()
+    with connection.Listener(family="AF_UNIX"):
+        pass
+
+
+def test_sockets_stay_where_they_fit(temporary, monkeypatch):
+    monkeypatch.setattr(collect, "_SOCKET", 400)
+    folder = temporary(150)
+    collect._shorten_sockets()
+    assert util.get_temp_dir().startswith(str(folder))
+
+
+def test_without_room_for_sockets_nothing_waits_for_them(temporary, monkeypatch):
+    temporary(150)
+    util.get_temp_dir()
+
+    def refuse(**options):
+        raise PermissionError
+
+    monkeypatch.setattr(tempfile, "mkdtemp", refuse)
+    with pytest.raises(ConfigError, match="TMPDIR: expected a folder whose name has at most 71 bytes"):
+        collect._shorten_sockets()

@@ -20,7 +20,7 @@ from torchrl.record.loggers.csv import CSVLogger
 
 from torchrl_sspl.data import TransitionStore
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError
 from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
@@ -337,6 +337,31 @@ def test_a_signal_between_two_steps_on_a_batch_continues_bit_for_bit(tmp_path: P
     assert_same(weights(straight), weights(second))
     logs = [(tmp_path / name / "log.jsonl").read_text() for name in ("straight", "broken")]
     assert logs[0] == logs[1]
+
+
+@pytest.mark.parametrize("error", [RuntimeError("At least one process failed"), BrokenPipeError()])
+def test_what_fails_for_want_of_workers_that_a_signal_has_ended_is_no_failure(tmp_path: Path, capsys, error: Exception) -> None:
+    def end_all() -> None:
+        signal.raise_signal(signal.SIGTERM)
+        raise error
+
+    trainer = build(tmp_path)
+    trainer.register_op("post_steps", end_all)
+    with pytest.raises(SystemExit) as ended:
+        trainer.train()
+    assert ended.value.code == 143
+    assert capsys.readouterr().err.count("interrupted by SIGTERM") == 1
+
+
+def test_a_checkpoint_that_cannot_be_written_at_a_signal_is_said(tmp_path: Path) -> None:
+    def refuse(*_: Any, **options: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    trainer = build(tmp_path, checkpoint_seconds=3600.0)
+    trainer.checkpoint_rotation.save = refuse  # type: ignore[method-assign,union-attr]
+    trainer.register_op("post_optim", lambda: signal.raise_signal(signal.SIGTERM) if trainer._optim_count == 1 else None)
+    with pytest.raises(OutputError, match="No space left"):
+        trainer.train()
 
 
 def test_the_log_holds_the_means_over_the_steps_on_a_batch(tmp_path: Path) -> None:

@@ -6,7 +6,11 @@ import atexit
 import contextlib
 import copy
 import functools
-import multiprocessing
+import multiprocessing.util
+import os
+import shutil
+import signal
+import tempfile
 import warnings
 import weakref
 from collections.abc import Callable, Iterator
@@ -26,6 +30,7 @@ from torchrl_sspl.sets import Region
 BACKENDS = ("sync", "process", "ray")
 _BATCH = 2048  # transitions at a time; an episode that a batch cuts in two costs two frames more
 _EPISODE = 64  # steps up to which no episode is cut
+_SOCKET = 103  # bytes of the longest name of a socket that macOS takes; Linux takes 107
 
 
 class RandomActions(TensorDictModuleBase):
@@ -188,6 +193,8 @@ def collect_rollouts(
     options.update(collector)
     if options["backend"] == "direct":
         options.setdefault("return_same_td", True)  # what is collected is copied into the store at once
+    else:
+        _shorten_sockets()
     with _starting_in(env, region):
         with warnings.catch_warnings():
             # Step counter and memory are two transforms of one environment, which is what TorchRL makes of them.
@@ -276,14 +283,37 @@ def make_collector(
         )  # fmt: skip
     copied = copy.deepcopy(policy).cpu()
     if backend == "process":
+        _shorten_sockets()
         collector = Collector(
             makers, copied, backend="process", sync=True, cat_results="stack", auto_register_policy_transforms=False,
-            **options,
+            # Control-C reaches workers too: without them the trainer could not save its state.
+            init_fn=functools.partial(signal.signal, signal.SIGINT, signal.SIG_IGN), **options,
         )  # fmt: skip
     else:
         collector = _ray_collector(makers, copied, ray_address, options)
     atexit.register(_end, weakref.ref(collector))
     return collector
+
+
+def _shorten_sockets() -> None:
+    """Lets this process and its workers keep their sockets elsewhere where ``TMPDIR`` is too long for the name of one.
+
+    Workers hand over tensors through them. Of a batch that cannot be handed over nobody tells the collector, which waits for it
+    for ever (https://github.com/python/cpython/issues/132124; newer versions of Python mend it).
+    """
+    longest = _SOCKET - len("/listener-01234567")
+    if os.name == "nt" or len(os.fsencode(multiprocessing.util.get_temp_dir())) <= longest:
+        return
+    for place in ("/tmp", "/var/tmp"):
+        with contextlib.suppress(OSError):
+            folder = tempfile.mkdtemp(prefix="pymp-", dir=place)
+            multiprocessing.util.Finalize(None, shutil.rmtree, args=(folder, True), exitpriority=-100)
+            multiprocessing.current_process()._config["tempdir"] = folder  # type: ignore[attr-defined]  # workers inherit it
+            return
+    raise ConfigError(
+        f"TMPDIR: expected a folder whose name has at most {longest - len('/pymp-01234567')} bytes, for the sockets of collectors in other "
+        f"processes, received '{tempfile.gettempdir()}', and cannot write to /tmp or /var/tmp; set TMPDIR to a shorter one"
+    )
 
 
 def _end(collector: weakref.ref[BaseCollector]) -> None:

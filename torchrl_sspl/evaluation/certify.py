@@ -382,7 +382,7 @@ def verify_run(
         CheckpointError: if there is no such agent.
 
     Example:
-        >>> verify_run("pendulum", measure=False, report=lambda line: None)
+        >>> verify_run("pendulum", measure=False, seconds=3600, report=lambda line: None)  # on a busy machine too
         0
     """
     directory = agent_directory(name)

@@ -21,8 +21,8 @@ from torchrl.data import ReplayBuffer
 from torchrl.objectives import SoftUpdate, TargetNetUpdater
 from torchrl.trainers import ReplayBufferTrainer, TargetNetUpdaterHook, Trainer, UpdateWeights
 
-from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError
-from torchrl_sspl.interrupts import end_if_pending, interruptible, pending, saving
+from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError, SSPLError
+from torchrl_sspl.interrupts import Interrupted, end_if_pending, interruptible, pending, saving
 from torchrl_sspl.modules import make_rollout_policy
 from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
 from torchrl_sspl.trainers.hooks import ClockHook, EveryHook, FitEncoderHook, LogHook, MarginHook, SeedHook
@@ -252,9 +252,11 @@ class SSPLTrainer(Trainer):
                     self.phases.run()
                     self.save_trainer(force_save=True)
                 self.collector.shutdown()
-        except BaseException:
+        except BaseException as error:
             with suppress(Exception):
                 self.collector.shutdown()  # its processes would outlive an exception
+            if not isinstance(error, Interrupted | SSPLError):
+                end_if_pending()  # a signal to all processes ends the workers as well, and what waits for them fails
             raise
         finally:
             self._bar.close()
@@ -341,6 +343,8 @@ class SSPLTrainer(Trainer):
         metadata = self._checkpoint_manifest_metadata()
         try:
             self.checkpoint_rotation.save(checkpoint, step=step, components=names, metadata=metadata)
+        except ConnectionError:  # of a worker that has ended
+            raise
         except OSError as error:
             raise OutputError(
                 f"expected to write a checkpoint to '{self.checkpoint_rotation.directory}', received {error.strerror or error}; "
