@@ -80,7 +80,7 @@ def test_what_is_shown_changes_when_the_log_grows(tmp_path, monkeypatch):
     page = text_of(pages[0])
     assert "<title>sspl watch: run</title>" in pages[0]
     assert not re.search(r"(src|href)=\"(?!data:)|https?://|@import", pages[0])  # nothing from elsewhere
-    for words in ("round 1 of 2: fitting", "4,200 of 9,100", "Loss 0.75", "none yet", "4 min left of this phase, then 3 more", "fit: unsafe"):
+    for words in ("Round 1 of 2: fitting", "4,200 of 9,100", "Loss 0.75", "none yet", "4 min left of this phase, then 3 more", "fit: unsafe"):
         assert words in page, words
     first, second = (text_of(event["html"]) for event in told)
     assert "None yet" in first

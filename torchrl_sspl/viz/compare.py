@@ -206,7 +206,7 @@ def compare(runs: Sequence[str | Path] | Sequence[Run], path: str | Path, *, tit
 
 
 def _overview(runs: Sequence[Run]) -> Table:
-    cells = []
+    cells: list[list[str | Cell]] = []
     for run in runs:
         m, verdicts = run.metrics, list(run.metrics.get("verdicts", {}).values())
         missed = sum(not str(v).startswith(("aim", "must")) for v in verdicts)
@@ -223,7 +223,7 @@ def _tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:
     """Every setting with its rows."""
     out = []
     for setting, block, names in _blocks(rows):
-        cells = []
+        cells: list[list[str | Cell]] = []
         for r in block:
             label, must, mean, worst, verdict = _cells(r)
             each = [format_value(r.values[n], r.unit) if n in r.values else "" for n in names]
@@ -240,7 +240,7 @@ def _side(rows: Sequence[Row]) -> Table | None:
     places: dict[str, dict[str, Row]] = {}
     for r in rows:
         places.setdefault(r.label, {})[r.setting] = r
-    cells = []
+    cells: list[list[str | Cell]] = []
     for label, found in places.items():
         each: dict[str, Cell] = {}
         for setting, r in found.items():
@@ -252,7 +252,7 @@ def _side(rows: Sequence[Row]) -> Table | None:
 
 
 def _settings(runs: Sequence[Run], keys: Sequence[str]) -> Table | None:
-    cells = [[Cell(k, "code"), *(_show(run.settings.get(k)) for run in runs)] for k in keys]
+    cells: list[list[str | Cell]] = [[Cell(k, "code"), *(_show(run.settings.get(k)) for run in runs)] for k in keys]
     return Table(["Key", *(run.name for run in runs)], cells) if keys else None
 
 

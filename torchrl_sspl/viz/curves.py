@@ -100,7 +100,7 @@ def _panel(title: str, lines: Mapping[int, list[tuple[float, float]]]) -> Panel:
         return f"{across:.1f},{130 - 110 * (height(y) - low) / ((high - low) or 1):.1f}"
 
     drawn = [(k % COLOURS, " ".join(place(*p) for p in line[:: len(line) // 400 + 1])) for k, line in lines.items()]
-    bottom, top = (f"{10**v if log else v:.2g}" for v in (low, high))
+    bottom, top = (f"{10**v if log else v:.3g}" for v in (low, high))
     return Panel(title, drawn, bottom, top, f"{right:g}")
 
 

@@ -168,7 +168,8 @@ def verdict_in(unit: str, verdict: str) -> str:
 
 def _summary(rows: Sequence[Sequence[Any]], measurements: Mapping[str, dict[str, Any]]) -> tuple[str, str, Table | None]:
     """Headline, its class, and the table with must and aim."""
-    kinds, out = [], []
+    kinds: list[str] = []
+    out: list[list[str | Cell]] = []
     for row in rows:
         if len(row) != 5:
             raise ShapeError(f"summary: expected rows (label, value, must, aim, verdict), received {len(row)} entries.")
@@ -373,7 +374,7 @@ def _paragraphs(notes: str) -> list[str]:
 
 def _measurements(data: Mapping[str, dict[str, Any]]) -> Table:
     """Every measurement with its bound, size and how it was made."""
-    rows = [
+    rows: list[list[str | Cell]] = [
         [Cell(name, "code"), format_value(m.get("value"), m.get("unit", "")), _bound(m), _count(m.get("n")), str(m.get("note", ""))]
         for name, m in data.items()
     ]

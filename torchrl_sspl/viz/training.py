@@ -124,11 +124,12 @@ def read_training(directory: Path) -> dict[str, Any]:
 def _state(directory: Path, now: dict[str, Any], metrics: dict[str, Any], log: list[dict[str, Any]]) -> tuple[str, str, str]:
     """Headline, its kind, and what has to be added."""
     if now:
+        phase = now["phase"][:1].upper() + now["phase"][1:]
         with suppress(OSError):
             silent = time.time() - (directory / PROGRESS_FILE).stat().st_mtime
             if silent >= _SILENT:
-                return now["phase"], "fair", f"No sign of it for {spoken(silent)}: a phase without steps takes long, or it was killed."
-        return now["phase"], "none", ""
+                return phase, "fair", f"No sign of it for {spoken(silent)}: a phase without steps takes long, or it was killed."
+        return phase, "none", ""
     if "measurements" in metrics:
         return "Trained and evaluated", "good", f"{metrics.get('stop_reason') or 'All phases are done'}. The result is in report.html."
     if (directory / "agent").is_dir():
