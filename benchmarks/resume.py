@@ -28,7 +28,7 @@ FAST = [
     "evaluation.episodes=4", "evaluation.horizon=2", "evaluation.renderer_episodes=0", "evaluation.walks=0",
     "evaluation.certificate_episodes=0", "evaluation.certificate_seconds=1",
 ]  # fmt: skip
-BAR = re.compile(r"(?P<phase>[a-z_]+(?: \d+)?):\s+\d+%\|[^|]*\|\s*(?P<step>\d+)/(?P<of>\d+)")
+BAR = re.compile(r"(?P<phase>[a-z][\w :]*?) +\d+%\|[^|]*\| *(?P<step>\d+)/\d+ steps")  # one bar: the steps are those of all phases
 
 
 @dataclass
@@ -76,8 +76,7 @@ class Training:
             self.seen.text = (self.seen.text + part)[-200_000:]
             self.seen.resumed |= "resumed" in part
             for found in BAR.finditer(part):
-                if found["phase"].split()[0] in PHASES:
-                    self.seen.times.setdefault((found["phase"], int(found["step"])), time.monotonic() - self.began)
+                self.seen.times.setdefault((found["phase"], int(found["step"])), time.monotonic() - self.began)
 
     def finish(self) -> Seen:
         """Wait for its end."""
@@ -111,9 +110,6 @@ class Training:
         if self.process.returncode == 128 + number and "Traceback" not in self.seen.text and len(said) == 1 and str(folder) in said[0]:
             return ""
         return f"; WRONG END: code {self.process.returncode}, said {said}, then {self.seen.text[-1500:]!r}"
-
-
-PHASES = ("joint", "gather", "dynamics", "teach", "fit", "steer", "tune", "check", "level")
 
 
 def moments(seen: Seen, kills: int, draw: random.Random) -> list[tuple[str, int, float]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -105,3 +106,18 @@ def test_every_phase_has_words():
 
     for settings in (SynthesisConfig(), SynthesisConfig(teacher="clearance", tolerated_error=0.1)):
         assert {phase.name for phase in synthesis_phases(settings)} <= set(WORDS)
+
+
+def test_the_benchmark_that_interrupts_trainings_reads_every_phase_off_the_bar(clock, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "benchmarks"))
+    import resume
+
+    file = io.StringIO()
+    bar, phases = Progress(100, 0, file=file), ["joint training", *(f"round 1 of 2: {words}" for words in WORDS.values()), *WORDS.values()]
+    for phase in phases:
+        bar.begin(phase, 4)
+        clock.seconds += 1.0
+        bar.tick(lambda: 0.5)
+    found = [(found["phase"], int(found["step"])) for found in resume.BAR.finditer(file.getvalue())]
+    assert list(dict.fromkeys(phase for phase, _ in found)) == ["starting", *phases]
+    assert found[-1][1] == len(phases)
