@@ -44,6 +44,7 @@ _NEAR_ZERO = 0.06  # of the targets on a grid, those that a batch has as many of
 _POOL = 8192  # counterexamples that are kept
 _LOOK_EVERY = 25  # steps between two searches where hardly any are left
 _STARTS = 1024  # latents from which they are climbed to
+_BESIDE = 0.05  # barrier value up to which these may lie outside the set
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
@@ -373,38 +374,40 @@ class Tighten(FineTune):
         if len(old):
             points += [old, old[work.loop.pick(len(old), samples // 2)] + 0.01 * torch.randn(samples // 2, p, generator=g)]
         z = within(torch.cat(points), work.direction)
-        z = z[work.barrier(z)[:, 0] <= 0.02]
+        here = work.barrier(z)[:, 0]
+        z, here = z[here <= _BESIDE], here[here <= _BESIDE]
         if not len(z):
             return z
         error = work.config.tolerated_error
         after = work.dynamics(z, work.acting(z))
         value = work.barrier(after)[:, 0]
-        possible = value > -0.01 - _SPARE - work.lipschitz_bound * error
-        climbed = self._ascend(work, z[value.topk(min(_STARTS, len(z))).indices])
+        # Where the set ends in a cusp, more samples lie beside it than in it.
+        starts = (value - 3.0 * here.clamp_min(0.0)).topk(min(_STARTS, len(z))).indices
+        climbed = self._ascend(work, z[starts])
+        possible = (value > -0.01 - _SPARE - work.lipschitz_bound * error) & (here <= 0.02)
         z, after = torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))])
         value = work.barrier(after + worst_error(work.barrier, after, error))[:, 0] + _SPARE
         worst = value.topk(min(_POOL, len(value)))
         return z[worst.indices[worst.values > -0.01]]
 
     @staticmethod
-    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 12) -> Tensor:
-        """Latents of the set ``(n, p)`` after which the barrier is highest, climbed to from as many: samples alone miss narrow
-        peaks, and so does one climb with steps that shrink."""
-        best = latent
-        for _ in range(restarts):
-            z = best
+    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 24) -> Tensor:
+        """The best latents of the set that are climbed to from ``(n, p)``: samples alone miss narrow peaks, and so does one climb
+        with steps that shrink. Each climbs on its own, so that not all end on the same peak."""
+        best, highest = latent, torch.full((len(latent),), -math.inf)
+        for attempt in range(restarts):
+            z = best if attempt == 0 else within(best + 0.005 * torch.randn(best.shape, generator=work.loop.generator), work.direction)
             for k in range(steps):
                 with torch.enable_grad():
                     at = z.detach().requires_grad_()
                     here = work.barrier(at)[:, 0]
                     value = work.barrier(work.dynamics(at, work.acting(at).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
                     (slope,) = torch.autograd.grad(value.sum(), at)
-                z = within(z + 0.03 * 0.8**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
-            best = torch.cat([best, z])
-            after = work.barrier(work.dynamics(best, work.acting(best)))[:, 0]
-            inside = work.barrier(best)[:, 0] <= _SPARE
-            best = best[torch.where(inside, after, -math.inf).topk(len(latent)).indices]
-        return best[work.barrier(best)[:, 0] <= 0.02]
+                z = within(z + 0.03 * 0.85**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
+            value = work.barrier(work.dynamics(z, work.acting(z)))[:, 0].masked_fill(work.barrier(z)[:, 0] > _SPARE, -math.inf)
+            better = value > highest
+            best, highest = torch.where(better[:, None], z, best), torch.where(better, value, highest)
+        return best[highest > -math.inf]
 
 
 class Settle(Tighten):
