@@ -95,11 +95,7 @@ def watch(
     _check(env, video, policy, protect, record, port, steps, fps, noise)
     training = training_directory(name)
     if training is not None:
-        if env is not None or video is not None or policy != "own" or protect or record is not None:
-            raise ConfigError(
-                f"expected no env, video, policy, filter or record with a training, received one; '{training}' has no calibrated agent that "
-                "could act yet: `sspl calibrate` makes one of a run that has ended"
-            )
+        _check_training(training, acts=env is not None or video is not None or policy != "own" or protect or record is not None)
         return watch_training(training, host=host, port=port, changes=steps, ready=ready)
     monitor = Monitor.load(name)
     agent = monitor.agent
@@ -135,6 +131,15 @@ def watch(
         if film is not None:
             film.close()
     return view.counts
+
+
+def _check_training(directory: Path, acts: bool) -> None:
+    """A ConfigError if something is asked for that acts."""
+    if acts:
+        raise ConfigError(
+            f"expected no env, video, policy, filter or record with a training, received one; '{directory}' has no calibrated agent that "
+            "could act yet: `sspl calibrate` makes one of a run that has ended"
+        )
 
 
 def _check(
