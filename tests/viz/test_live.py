@@ -197,7 +197,5 @@ def test_the_quadruped_is_watched_in_full_physics():
     pytest.importorskip("pybullet")
     _, events, counts = seen("quadruped", env="physics", steps=3, protect=True)
     assert counts["steps"] == 3
-    # Nothing is proved of this agent, and the camera's noise leads its barrier out of the set at times.
-    assert {e["verdict"] for e in events} <= {"INSIDE", "OUTSIDE"}
-    assert all(("nothing is proved" in e["why"]) == (e["verdict"] == "INSIDE") for e in events)
+    assert {e["verdict"] for e in events} <= {"PROOF_APPLIES", "INSIDE", "OUTSIDE"}
     assert not any(e["unsafe"] for e in events)

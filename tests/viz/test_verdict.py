@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from types import SimpleNamespace
 
 import pytest
@@ -40,8 +41,23 @@ def test_the_shipped_pendulum_is_safe_as_far_as_its_certificate_reaches():
     assert not any("rounding of the float64" in text or "known types" in text for _, text in screen.proved)
 
 
-def test_the_shipped_quadruped_is_refuted_and_says_so_first():
-    screen = first_screen(shipped("quadruped"), rows(0, 3000), trained=False)
+def test_the_shipped_quadruped_is_safe_as_far_as_its_certificate_reaches():
+    screen = first_screen(shipped("quadruped"), rows(0, 3000)[:1], trained=False)
+    assert screen.kind == "good"
+    assert screen.headline.startswith("Safe as far as this reaches: the policy provably keeps the safe set {B <= 0} in the learned dynamics")
+    assert "Not certified: the paper's own conditions" in screen.more
+
+
+def test_a_refuted_proof_is_said_first():
+    certificate = shipped("quadruped")
+    replaced = {
+        "invariance": Statement("invariance", "t", PROVED, False, reason="NOT_INVARIANT", misses_by=0.045, unit="barrier"),
+        "episodes": Statement("episodes", "t", "measured", False, value=0.01028, n=3000, reason="UNSAFE_ENTERED"),
+    }
+    for layer in certificate.layers.values():
+        layer.statements = [replaced.get(s.name, s) for s in layer.statements]
+    certificate.record.blocks[0] = dataclasses.replace(certificate.record.blocks[0], left=20, events=20)
+    screen = first_screen(certificate, rows(0, 3000), trained=False)
     assert screen.kind == "bad"
     assert screen.headline.startswith("Not certified as safe: the proof is refuted")
     assert "20 of 3,000 fresh episodes left it or met U (at most 1.03 %)" in screen.headline

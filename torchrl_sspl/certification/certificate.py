@@ -68,6 +68,7 @@ class Reason(StrEnum):
     CALIBRATION_REUSED = "the episodes are not fresh: their seed or their observations were used before"
     LABELS_LEAKED = "labelled observations of the measurement were trained on"
     CONDITION_FAILS = "a condition does not hold on the held-out samples with the paper's margins"
+    NO_LIPSCHITZ = "the policy chooses, so that its closed loop has no Lipschitz constant"
     WEIGHTS_CHANGED = "the weights are not those that were certified"
     CONFIGURATION_CHANGED = "the configuration is not the one that was certified"
     NUMBERS_CHANGED = "a number or a verdict is not what the weights give"

@@ -338,7 +338,7 @@ def paper_layer(record: Record, lipschitz_bound: float, *, chooses: bool = False
     number = {k: math.nan if v is None else v for k, v in record.numbers.items()}
     psi, eta = lipschitz_bound * number["covering_radius"], lipschitz_bound * number["largest_error"]
     psi3 = psi * (number["closed_loop_constant"] + 1.0)
-    why = "no Lipschitz constant: the policy chooses" if chooses else ""
+    why = Reason.NO_LIPSCHITZ.value if chooses else ""
     for name, text, value in (
         ("safety margin", "psi* = L_B eps-bar, sampled", psi),
         ("dynamics margin", "eta* = L_B delta, sampled", eta),
@@ -355,9 +355,9 @@ def paper_layer(record: Record, lipschitz_bound: float, *, chooses: bool = False
     ):  # fmt: skip
         n, worst = sizes[kind], number[f"{kind}_worst"] + margin
         if not n or not math.isfinite(worst):
-            reason = Reason.NOT_FINITE if n else Reason.NOT_MEASURED
-            detail = why if name == "q3 as its proof needs it" else ""
-            layer.state(MEASURED, name, text, False, reason, n=n, detail=detail)
+            discontinuous = chooses and name == "q3 as its proof needs it"
+            reason = Reason.NOT_MEASURED if not n else Reason.NO_LIPSCHITZ if discontinuous else Reason.NOT_FINITE
+            layer.state(MEASURED, name, text, False, reason, n=n)
             continue
         of = {"value": worst, "misses_by": None if worst <= 0 else worst, "unit": "barrier", "n": n}
         detail = f"holds on {100 * sizes[met] / n:.4g} % of the samples"
