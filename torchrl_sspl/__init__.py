@@ -37,6 +37,7 @@ _NAMES = {
     "SaLaDLoss": "objectives",
     "SynthesisLoss": "objectives",
     "PolicyDeviationLoss": "objectives",
+    "ActionChangeLoss": "objectives",
     "LipschitzLoss": "objectives",
     "TargetLoss": "objectives",
     "ActionValueLoss": "objectives",

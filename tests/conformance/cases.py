@@ -14,6 +14,7 @@ from torchrl.objectives import LossModule
 from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.objectives import (
+    ActionChangeLoss,
     ActionValueLoss,
     ConsistencyLoss,
     CounterexampleLoss,
@@ -256,5 +257,13 @@ CASES = [
         {"loss_counterexample": {"barrier", "actor_network"}},
         "dynamics barrier policy",
         {"mode": "least", "depth": 2.0, "worst_fraction": 0.25, "dynamics_margin": 1.0},
+    ),
+    Case(
+        "action-change",
+        ActionChangeLoss,
+        "latent",
+        {"loss_action_change": {"actor_network"}},
+        "dynamics policy",
+        {"action_scale": 0.5},
     ),
 ]

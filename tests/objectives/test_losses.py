@@ -17,6 +17,7 @@ from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, SaLaD
 from torchrl_sspl.objectives import (
     PRESETS,
+    ActionChangeLoss,
     LipschitzLoss,
     PolicyDeviationLoss,
     SaLaDLoss,
@@ -238,6 +239,24 @@ def test_deviation_is_the_distance_to_the_users_action(user: str) -> None:
     loss = PolicyDeviationLoss(None, Reads(0.0, 0.5), user_policy=policy)
     assert loss(data)["loss_policy_deviation"].item() == pytest.approx(abs(difference))
     assert len(list(loss.parameters())) == 2
+
+
+def test_the_change_of_an_action_is_that_to_the_next_step_in_shares_of_the_scale() -> None:
+    class Adds(nn.Module):
+        def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+            return latent + 0.5 * action
+
+    policy = nn.Linear(1, 1, bias=False)
+    with torch.no_grad():
+        policy.weight.fill_(3.0)
+    loss = ActionChangeLoss(Adds(), policy, action_scale=2.0)
+    latent = torch.tensor([[1.0], [-2.0]])
+    found = loss(TensorDict(latent=latent, batch_size=2))["loss_action_change"]
+    # u = 3 z, z' = z + 1.5 z, u' = 7.5 z: a change of 4.5 |z|
+    assert found.item() == pytest.approx(4.5 * 1.5 / 2.0)
+    found.backward()
+    # The successor is held still: d/dw |w z' - w z| / 2 at z' = 2.5 z.
+    assert next(loss.actor_network_params.parameters()).grad.item() == pytest.approx(1.5 * 1.5 / 2.0)
 
 
 def test_extras_are_off_in_the_paper_preset() -> None:

@@ -1,7 +1,8 @@
-"""The loss that keeps the policy near a user's policy."""
+"""Losses on the policy's actions themselves: near a user's policy, and near those of the step before."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -84,3 +85,43 @@ class PolicyDeviationLoss(LatentLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
         """The loss on a batch of observations (or frames, or latents); the batch is not changed."""
         return self._pack(self._deviation_terms(self._read(tensordict)), tensordict)
+
+
+class ActionChangeLoss(LatentLoss):
+    r"""Keeps the policy's action near its action at the next step.
+
+    .. math:: L = \operatorname{mean} \| (\pi(d(z, \pi(z))) - \pi(z)) / s \|_2
+
+    The norm is not squared: many small changes, which shake an actuator at rest, count as much as one large change, which safety may need. The
+    successor is held still, so that the policy is not led to where it acts alike.
+
+    Output: ``loss_action_change``. Source: none.
+
+    Args:
+        dynamics: (latent, action) -> next latent ``(*batch, p)``; held still.
+        policy: latent -> action ``(*batch, action_dim)`` in physical units.
+        action_scale: s, a number or one per dimension of the action, physical units.
+        **shared: ``reduction``; see :class:`LatentLoss`, for errors too.
+
+    Example:
+        >>> from torchrl_sspl.modules import LatentDynamics, Policy
+        >>> loss = ActionChangeLoss(LatentDynamics(2, 1), Policy(2, 1))
+        >>> loss(TensorDict(latent=torch.rand(8, 2), batch_size=8))["loss_action_change"].shape
+        torch.Size([])
+    """
+
+    def __init__(
+        self, dynamics: nn.Module, policy: nn.Module, *, action_scale: float | Sequence[float] = 1.0, **shared: Any
+    ) -> None:
+        super().__init__(dynamics=dynamics, policy=policy, **shared)
+        self._set_action_scale(action_scale)
+        self.out_keys.append("loss_action_change")
+
+    @dispatch
+    def forward(self, tensordict: TensorDictBase) -> TensorDict:
+        """The loss on a batch of latents; the batch is not changed."""
+        batch = self._read(tensordict)
+        action = trained_action(self, batch.latent)
+        after = self._run("dynamics", batch.latent, action, params="frozen").detach()
+        change = (trained_action(self, after) - action) / self.action_scale
+        return self._pack({"loss_action_change": self._reduce(change.norm(dim=-1, keepdim=True), batch)}, tensordict)

@@ -39,7 +39,7 @@ class SafetyWrapper(gymnasium.Wrapper):
     Example:
         >>> from torchrl_sspl.modules.agent import load
         >>> env = gymnasium.make("SSPL/QuadrupedObstacle-v0")  # doctest: +SKIP
-        >>> env = SafetyWrapper(env, load("quadruped"), margin=0.02)  # doctest: +SKIP
+        >>> env = SafetyWrapper(env, load("quadruped"))  # doctest: +SKIP
     """
 
     def __init__(self, env: gymnasium.Env, agent: Agent, **options: Any) -> None:
@@ -85,7 +85,7 @@ class SafetyVectorWrapper(VectorWrapper):
     Example:
         >>> from torchrl_sspl.modules.agent import load
         >>> envs = gymnasium.make_vec("SSPL/QuadrupedObstacle-v0", num_envs=4)  # doctest: +SKIP
-        >>> envs = SafetyVectorWrapper(envs, load("quadruped"), margin=0.02)  # doctest: +SKIP
+        >>> envs = SafetyVectorWrapper(envs, load("quadruped"))  # doctest: +SKIP
     """
 
     def __init__(self, env: VectorEnv, agent: Agent, **options: Any) -> None:

@@ -24,7 +24,14 @@ from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.direction import within
 from torchrl_sspl.modules.observer import corrected, gain_matrix
-from torchrl_sspl.objectives import ActionValueLoss, ConsistencyLoss, CounterexampleLoss, SynthesisLoss, TargetLoss
+from torchrl_sspl.objectives import (
+    ActionChangeLoss,
+    ActionValueLoss,
+    ConsistencyLoss,
+    CounterexampleLoss,
+    SynthesisLoss,
+    TargetLoss,
+)
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
@@ -271,6 +278,8 @@ class FineTune(_Training):
             worst_coeff=1.0, worst_fraction=0.02, off_manifold_coeff=1.0,
         )  # fmt: skip
         target = self._target(work)
+        calm = (table["barrier_target"][:, 0] < -s.margin).nonzero()[:, 0]
+        change = ActionChangeLoss(work.dynamics, work.policy, action_scale=work.action_scale)
         # What the sets hold counts more than its share of the data; S may be empty.
         shares = ((unsafe, s.batch // 2), (unsafe[nearest], s.batch // 2), (safe, s.batch // 4))
         pick = work.loop.pick
@@ -291,6 +300,9 @@ class FineTune(_Training):
             terms = condition(asked)
             terms.update(target(table[torch.cat(drawn)]))
             terms.update(self.more(work, rim["latent"]))
+            if s.change_coeff > 0 and len(calm):
+                steady = change(table[calm[pick(len(calm), s.batch)]])
+                terms["loss_action_change"] = s.change_coeff * steady["loss_action_change"]
             return terms
 
         work.loop(self.size(work), self.rates(work), step)
