@@ -191,7 +191,7 @@ def test_counterexamples_that_no_sample_hits_are_climbed_to():
 
     work = SimpleNamespace(barrier=lambda z: z[:, :1], dynamics=step, acting=lambda z: z[:, :1], direction=None, loop=InnerLoop(0))
     start = peaks[:1] + 0.2 * torch.nn.functional.normalize(torch.randn(50, 2, generator=g), dim=1)
-    found = synthesis.Tighten._ascend(work, start)
+    found = synthesis.Settle._ascend(work, start)
     assert float(step(start, None)[:, 0].max()) < 0.2
     assert float(step(found, None)[:, 0].max()) > 0.8
     assert float(found[:, 0].max()) <= 0.02

@@ -51,6 +51,7 @@ _NEAR_ZERO = 0.06  # of the targets on a grid, those that a batch has as many of
 _POOL = 8192  # counterexamples that are kept
 _LOOK_EVERY = 25  # steps between two searches where hardly any are left
 _STARTS = 1024  # latents from which they are climbed to
+_INSIDE = 0.02  # barrier value up to which what is outside counts as counterexample, too
 _BESIDE = 0.05  # barrier value up to which these may lie outside the set
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
@@ -278,7 +279,8 @@ class FineTune(_Training):
             worst_coeff=1.0, worst_fraction=0.02, off_manifold_coeff=1.0,
         )  # fmt: skip
         target = self._target(work)
-        calm = (table["barrier_target"][:, 0] < -s.margin).nonzero()[:, 0]
+        depth = table["barrier_target"][:, 0]
+        calm = (depth < 0.5 * depth.min().clamp_max(0.0)).nonzero()[:, 0]  # nearer to the border safety needs the action
         change = ActionChangeLoss(work.dynamics, work.policy, action_scale=work.action_scale)
         # What the sets hold counts more than its share of the data; S may be empty.
         shares = ((unsafe, s.batch // 2), (unsafe[nearest], s.batch // 2), (safe, s.batch // 4))
@@ -378,48 +380,37 @@ class Tighten(FineTune):
         return {k: _WEIGHT * v if k.startswith("loss") else v for k, v in terms.items()}
 
     @torch.no_grad()
-    def _search(self, work: Workspace, rim: Tensor, samples: int = 150_000) -> Tensor:
+    def _search(self, work: Workspace, rim: Tensor) -> Tensor:
         """The worst latents of the set, up to as many as are kept; those that are nearly counterexamples count, too."""
+        z = self._drawn(work, rim, 60_000)
+        z = z[work.barrier(z)[:, 0] <= _INSIDE]
+        if not len(z):
+            return z
+        after = work.dynamics(z, work.acting(z))
+        possible = work.barrier(after)[:, 0] > self._least(work)
+        return self._worst(work, z[possible], after[possible])
+
+    @staticmethod
+    def _drawn(work: Workspace, rim: Tensor, samples: int) -> Tensor:
+        """Latents near the data, anywhere, and around those that were counterexamples."""
         g, p, old = work.loop.generator, work.latent_dim, work.counterexamples
         near = rim[work.loop.pick(len(rim), samples)] + 0.04 * torch.randn(samples, p, generator=g)
         points = [near, uniform(work, samples, g)]
         if len(old):
             points += [old, old[work.loop.pick(len(old), samples // 2)] + 0.01 * torch.randn(samples // 2, p, generator=g)]
-        z = within(torch.cat(points), work.direction)
-        here = work.barrier(z)[:, 0]
-        z, here = z[here <= _BESIDE], here[here <= _BESIDE]
-        if not len(z):
-            return z
-        error = work.config.tolerated_error
-        after = work.dynamics(z, work.acting(z))
-        value = work.barrier(after)[:, 0]
-        # Where the set ends in a cusp, more samples lie beside it than in it.
-        starts = (value - 3.0 * here.clamp_min(0.0)).topk(min(_STARTS, len(z))).indices
-        climbed = self._ascend(work, z[starts])
-        possible = (value > -0.01 - _SPARE - work.lipschitz_bound * error) & (here <= 0.02)
-        z, after = torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))])
-        value = work.barrier(after + worst_error(work.barrier, after, error))[:, 0] + _SPARE
-        worst = value.topk(min(_POOL, len(value)))
-        return z[worst.indices[worst.values > -0.01]]
+        return within(torch.cat(points), work.direction)
 
     @staticmethod
-    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 24) -> Tensor:
-        """The best latents of the set that are climbed to from ``(n, p)``: samples alone miss narrow peaks, and so does one climb
-        with steps that shrink. Each climbs on its own, so that not all end on the same peak."""
-        best, highest = latent, torch.full((len(latent),), -math.inf)
-        for attempt in range(restarts):
-            z = best if attempt == 0 else within(best + 0.005 * torch.randn(best.shape, generator=work.loop.generator), work.direction)
-            for k in range(steps):
-                with torch.enable_grad():
-                    at = z.detach().requires_grad_()
-                    here = work.barrier(at)[:, 0]
-                    value = work.barrier(work.dynamics(at, work.acting(at).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
-                    (slope,) = torch.autograd.grad(value.sum(), at)
-                z = within(z + 0.03 * 0.85**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
-            value = work.barrier(work.dynamics(z, work.acting(z)))[:, 0].masked_fill(work.barrier(z)[:, 0] > _SPARE, -math.inf)
-            better = value > highest
-            best, highest = torch.where(better[:, None], z, best), torch.where(better, value, highest)
-        return best[highest > -math.inf]
+    def _least(work: Workspace) -> float:
+        """Barrier value after a step below which no error makes a counterexample, or nearly one."""
+        return -0.01 - _SPARE - work.lipschitz_bound * work.config.tolerated_error
+
+    @staticmethod
+    def _worst(work: Workspace, z: Tensor, after: Tensor) -> Tensor:
+        """Those of latents with their successors that end highest under the worst error."""
+        value = work.barrier(after + worst_error(work.barrier, after, work.config.tolerated_error))[:, 0] + _SPARE
+        worst = value.topk(min(_POOL, len(value)))
+        return z[worst.indices[worst.values > -0.01]]
 
 
 class Settle(Tighten):
@@ -454,7 +445,7 @@ class Settle(Tighten):
 
         def step() -> dict[str, Tensor]:
             if work.loop.step % _LOOK_EVERY == 0:  # those that are known are gone after a few steps, others have come up
-                work.counterexamples = self._search(work, rim["latent"], samples=30_000)
+                work.counterexamples = self._search(work, rim["latent"])
             asked = [rim["latent"][pick(len(rim), s.batch)]]
             if len(work.counterexamples):
                 known = len(work.counterexamples)  # the worst come first, and more often
@@ -469,6 +460,41 @@ class Settle(Tighten):
             return terms
 
         work.loop(self.size(work), self.rates(work), step)
+
+    @torch.no_grad()
+    def _search(self, work: Workspace, rim: Tensor) -> Tensor:
+        """Fewer samples, from the best of which the worst latents are climbed to: of cusps samples alone find none."""
+        z = self._drawn(work, rim, 30_000)
+        here = work.barrier(z)[:, 0]
+        z, here = z[here <= _BESIDE], here[here <= _BESIDE]
+        if not len(z):
+            return z
+        after = work.dynamics(z, work.acting(z))
+        value = work.barrier(after)[:, 0]
+        # Where the set ends in a cusp, more samples lie beside it than in it.
+        starts = (value - 3.0 * here.clamp_min(0.0)).topk(min(_STARTS, len(z))).indices
+        climbed = self._ascend(work, z[starts])
+        possible = (value > self._least(work)) & (here <= _INSIDE)
+        return self._worst(work, torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))]))
+
+    @staticmethod
+    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 24) -> Tensor:
+        """The best latents of the set that are climbed to from ``(n, p)``: samples alone miss narrow peaks, and so does one climb
+        with steps that shrink. Each climbs on its own, so that not all end on the same peak."""
+        best, highest = latent, torch.full((len(latent),), -math.inf)
+        for attempt in range(restarts):
+            z = best if attempt == 0 else within(best + 0.005 * torch.randn(best.shape, generator=work.loop.generator), work.direction)
+            for k in range(steps):
+                with torch.enable_grad():
+                    at = z.detach().requires_grad_()
+                    here = work.barrier(at)[:, 0]
+                    value = work.barrier(work.dynamics(at, work.acting(at).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
+                    (slope,) = torch.autograd.grad(value.sum(), at)
+                z = within(z + 0.03 * 0.85**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
+            value = work.barrier(work.dynamics(z, work.acting(z)))[:, 0].masked_fill(work.barrier(z)[:, 0] > _SPARE, -math.inf)
+            better = value > highest
+            best, highest = torch.where(better[:, None], z, best), torch.where(better, value, highest)
+        return best[highest > -math.inf]
 
 
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
