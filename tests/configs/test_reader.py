@@ -82,12 +82,13 @@ def test_presets_mean_what_they_say():
     assert (paper.loss.preset, paper.network.barrier, paper.trainer.margins, paper.synthesis.enabled) == ("paper", "lmi", True, False)
     assert paper.loss.variance_coeff is paper.loss.covariance_coeff is paper.loss.saturation_limit is None
     assert paper.network.encoder == "FrameEncoder"
-    assert sound.network.latent_dim == paper.network.latent_dim == 4
+    assert (sound.network.latent_dim, paper.network.latent_dim) == (5, 4)
+    assert (paper.network.remember_action, paper.synthesis.choices, paper.synthesis.grid) == (False, 0, 0)
     assert compose(["env=pendulum", "preset=paper"]).network.latent_dim == 2
     own, quick = compose([]), compose(["preset=quick"])  # for systems of one's own
     assert smoke.trainer.total_frames < quick.trainer.total_frames < own.trainer.total_frames
     assert quick.evaluation.certificate_episodes >= 368  # of so many, none is at most 1 % with 97.5 % confidence
-    assert smoke.trainer.total_frames * 10 <= sound.trainer.total_frames
+    assert smoke.synthesis.transitions * 10 <= sound.synthesis.transitions
     assert smoke.evaluation.episodes * 10 < sound.evaluation.episodes
     assert smoke.evaluation.walks == 2
 
