@@ -10,12 +10,13 @@ from evaluation.systems import Counter, Predictor, World, lane, lane_agent, stra
 from tensordict import TensorDict
 from torch import nn
 
+from torchrl_sspl.direction import direction_of, within
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import AgentController, Camera, Decision, RandomController, as_controller
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.modules.agent import load
-from torchrl_sspl.modules.observer import corrected
+from torchrl_sspl.modules.observer import completed, corrected, held
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
@@ -25,9 +26,9 @@ COLUMNS = ("states", "actions", "barrier", "prediction_error", "barrier_error")
 @torch.no_grad()
 def plain_loop(agent, env, start, horizon):
     """States, actions, barrier values and errors of the same episodes, step by step, all frames drawn as they come."""
-    frames, head = agent.encoder.frames, agent.encoder.head
+    frames, head, turns = agent.encoder.frames, agent.encoder.head, direction_of(agent.dynamics)
     before, now = frames(env.draw(env.previous_state(start))), frames(env.draw(start))
-    state, latent = start, head(before, now)
+    state, latent = start, within(head(before, now), turns)
     rows = [[start], [], [agent.barrier(latent)[:, 0]], [], []]
     for _ in range(horizon):
         action = agent.policy(latent)
@@ -39,7 +40,9 @@ def plain_loop(agent, env, start, horizon):
         if not gone.all():
             now[~gone] = frames(env.draw(state[~gone]))
             latent = latent.clone()
-            latent[~gone] = corrected(promised[~gone], head(before[~gone], now[~gone]), agent.gain)[0]
+            seen = completed(head(before[~gone], now[~gone]), promised[~gone], agent.gain)
+            seen = corrected(promised[~gone], seen, agent.gain, turns)[0]
+            latent[~gone] = held(agent.barrier, promised[~gone], seen, agent.held_error, turns)[0]
         value = agent.barrier(latent)[:, 0]
         found = (state, action, value, (promised - latent).norm(dim=-1), value - agent.barrier(promised)[:, 0])
         fill = (None, None, -1.0, 0.0, 0.0)
