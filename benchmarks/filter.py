@@ -142,6 +142,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     env = env.known_twin() if given.physics else env
     start = starts(agent, env, given.episodes, torch.Generator().manual_seed(SEED))
     margin = given.margin if given.margin is not None or agent.tolerated_error > 0 else UNPROVED_MARGIN
+    if given.noise > 0.0 and not given.physics:
+        draw = noisy(env.draw, given.noise)
+        shown = agent.barrier(agent.encode(torch.cat([draw(env.previous_state(start)), draw(start)], 1)))[:, 0] <= 0.0
+        print(f"Starts that this camera shows in {{B <= 0}}: {int(shown.sum()):,} of {len(start):,}\n")
     print("| Actions | filter | episodes that enter U | hit | fallen | steps with an intervention | mean deviation [half ranges] |")
     print("|---|---|---|---|---|---|---|")
     policies = {"random": random_actions, "adversarial": ADVERSARIAL[given.agent], "own": None}

@@ -52,7 +52,7 @@ def test_a_run_writes_numbers_figures_report_and_agent(trained):
 def test_every_phase_was_run_in_both_rounds(trained):
     rows = [json.loads(line) for line in (trained[1] / "log.jsonl").read_text().splitlines()]
     for k in range(2):
-        assert {"dynamics", "teach", "fit", "steer", "tune", "check"} <= {row["phase"] for row in rows if row["round"] == k}
+        assert {"dynamics", "teach", "fit", "tighten", "check"} <= {row["phase"] for row in rows if row["round"] == k}
 
 
 def test_the_command_measures_it_on_the_car_that_turns_at_once(trained):
@@ -102,4 +102,4 @@ def test_every_preset_is_valid_and_can_be_overridden(preset):
     assert config.network.latent_dim == 5
     assert config.agent == ""
     assert config.evaluation.walks == 7
-    assert config.network.encoder == ("FrameEncoder" if preset == "paper" else "MomentEncoder")
+    assert config.network.encoder == ("FrameEncoder" if preset == "paper" else "TurnedBearingEncoder")
