@@ -227,7 +227,7 @@ def _verify(words: list[str]) -> int:
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
     text = "measure all episodes again, on the system that the agent names; runs its code, whoever wrote it"
     parser.add_argument("--measure", action="store_true", help=text)
-    parser.add_argument("--seconds", type=float, default=60.0, help="time for everything, without --measure (default: 60)")
+    parser.add_argument("--seconds", type=float, default=900.0, help="most time for everything, without --measure (default: 900)")
     options = parser.parse_args(words)
     from torchrl_sspl.evaluation.certify import verify_run
 
