@@ -411,13 +411,12 @@ def _proof_changes(
     mine: Layer, other: Layer, confirm: Callable[[str, float], bool | None] | None, repeat: Callable[[int], Layer] | None
 ) -> list[tuple[Reason, str]]:
     """What the deterministic layer claims beyond what was proved again."""
-    boxes = max((n for n in map(_boxes, mine.statements) if n is not None), default=0)
     early, late = (any(_gave_up(s) or _falls_short(s) for s in layer.statements) for layer in (mine, other))
     again: Layer | None = None
 
     def with_so_little_effort() -> Layer | None:
         nonlocal again
-        again = repeat(boxes) if again is None and repeat is not None else again
+        again = repeat(effort(mine)) if again is None and repeat is not None else again
         return again
 
     if early and not _same_names(mine, other, True):
@@ -534,9 +533,10 @@ def _falls_short(s: Statement) -> bool:
     return s.name in LOWER_BOUNDS and not s.holds
 
 
-def _boxes(s: Statement) -> int | None:
-    found = re.match(r"(\d{1,12}) boxes", s.detail)
-    return int(found.group(1)) if found and _gave_up(s) else None
+def effort(layer: Layer) -> int:
+    """Boxes after which a search of a deterministic layer gave up; 0 if none did."""
+    found = (re.match(r"(\d{1,12}) boxes", s.detail) for s in layer.statements if _gave_up(s))
+    return max((int(m.group(1)) for m in found if m), default=0)
 
 
 def _words(detail: str) -> str:
