@@ -19,6 +19,7 @@ import torchrl_sspl as sspl
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.evaluation.blocks import described_system
 from torchrl_sspl.evaluation.controllers import AgentController, Decision
+from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.evaluation.simulation import Episodes
 from torchrl_sspl.runtime import Protected, SafetyWrapper, Shield
 from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
@@ -143,8 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     start = starts(agent, env, given.episodes, torch.Generator().manual_seed(SEED))
     margin = given.margin if given.margin is not None or agent.tolerated_error > 0 else UNPROVED_MARGIN
     if given.noise > 0.0 and not given.physics:
-        draw = noisy(env.draw, given.noise)
-        shown = agent.barrier(agent.encode(torch.cat([draw(env.previous_state(start)), draw(start)], 1)))[:, 0] <= 0.0
+        shown = agent.barrier(encode_states(agent, env, start, draw=noisy(env.draw, given.noise)))[:, 0] <= 0.0
         print(f"Starts that this camera shows in {{B <= 0}}: {int(shown.sum()):,} of {len(start):,}\n")
     print("| Actions | filter | episodes that enter U | hit | fallen | steps with an intervention | mean deviation [half ranges] |")
     print("|---|---|---|---|---|---|---|")

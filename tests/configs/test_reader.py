@@ -88,6 +88,7 @@ def test_presets_mean_what_they_say():
     own, quick = compose([]), compose(["preset=quick"])  # for systems of one's own
     assert smoke.trainer.total_frames < quick.trainer.total_frames < own.trainer.total_frames
     assert quick.evaluation.certificate_episodes >= 368  # of so many, none is at most 1 % with 97.5 % confidence
+    assert smoke.trainer.total_frames * 10 <= sound.trainer.total_frames
     assert smoke.synthesis.transitions * 10 <= sound.synthesis.transitions
     assert smoke.evaluation.episodes * 10 < sound.evaluation.episodes
     assert smoke.evaluation.walks == 2

@@ -293,6 +293,16 @@ def _networks():
     return LatentDynamics(2, 1, (8,)), SandwichBarrier(2, (8,)), Policy(2, 1, (8,))
 
 
+def test_changes_of_the_action_are_a_term_of_the_fine_tuning_where_they_are_asked_for(tmp_path):
+    for coefficient, logged in ((0.0, False), (0.5, True)):
+        folder = tmp_path / str(coefficient)
+        experiment(folder, "synthesis.rounds=1", f"synthesis.change_coeff={coefficient}").train()
+        rows = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
+        tuned = [row for row in rows if row["phase"] == "tune"]
+        assert tuned
+        assert all(("loss_action_change" in row) == logged for row in tuned)
+
+
 class Count(Phase):
     name = "count"
 

@@ -22,6 +22,7 @@ from torchrl_sspl import cli
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.agent import load
+from torchrl_sspl.runtime import Monitor
 from torchrl_sspl.viz.live import watch
 from torchrl_sspl.viz.server import Feed
 
@@ -197,5 +198,19 @@ def test_the_quadruped_is_watched_in_full_physics():
     pytest.importorskip("pybullet")
     _, events, counts = seen("quadruped", env="physics", steps=3, protect=True)
     assert counts["steps"] == 3
-    assert {e["verdict"] for e in events} <= {"PROOF_APPLIES", "INSIDE", "OUTSIDE"}
+    assert {e["verdict"] for e in events} == {"PROOF_APPLIES"}
     assert not any(e["unsafe"] for e in events)
+
+
+def test_an_agent_without_a_proof_is_said_to_have_none(monkeypatch):
+    load = Monitor.load
+
+    def unproved(name: str) -> Monitor:
+        monitor = load(name)
+        monitor.agent.description["tolerated_error"] = 0.0
+        return monitor
+
+    monkeypatch.setattr(Monitor, "load", unproved)
+    _, events, _ = seen(steps=3)
+    assert {e["verdict"] for e in events} == {"INSIDE"}
+    assert all("nothing is proved of this agent" in e["why"] for e in events)

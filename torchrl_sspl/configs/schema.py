@@ -203,7 +203,8 @@ class SynthesisConfig:
         "adds to the batches of the fine-tuning (0: off).")
     unsafe_margin: float = _option(0.05, "hinge margin on labelled unsafe latents.")
     recovery_coeff: float = _option(0.3, "weight of the action that leads back, on latents outside the set.")
-    change_coeff: float = _option(0.0, "weight of changes of the action from step to step inside the set, in the fine-tuning.")
+    change_coeff: float = _option(0.0, "weight of changes of the action from step to step deep inside the set, in the fine-tuning "
+        "(which targets on a grid leave out).")
     guard: float = _option(0.02, "distance that held-out observations of U keep from the zero level (units of the "
         "barrier).")
     leave_share: float = _option(0.00075, "largest share of the held-out episodes of a round that may leave the set; "

@@ -51,8 +51,9 @@ _NEAR_ZERO = 0.06  # of the targets on a grid, those that a batch has as many of
 _POOL = 8192  # counterexamples that are kept
 _LOOK_EVERY = 25  # steps between two searches where hardly any are left
 _STARTS = 1024  # latents from which they are climbed to
-_INSIDE = 0.02  # barrier value up to which what is outside counts as counterexample, too
 _BESIDE = 0.05  # barrier value up to which these may lie outside the set
+_INSIDE = 0.02  # ... up to which what lies outside counts as a counterexample, too
+_NEARLY = 0.01  # ... below zero from which on a successor is nearly one
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
@@ -403,14 +404,14 @@ class Tighten(FineTune):
     @staticmethod
     def _least(work: Workspace) -> float:
         """Barrier value after a step below which no error makes a counterexample, or nearly one."""
-        return -0.01 - _SPARE - work.lipschitz_bound * work.config.tolerated_error
+        return -_NEARLY - _SPARE - work.lipschitz_bound * work.config.tolerated_error
 
     @staticmethod
     def _worst(work: Workspace, z: Tensor, after: Tensor) -> Tensor:
         """Those of latents with their successors that end highest under the worst error."""
         value = work.barrier(after + worst_error(work.barrier, after, work.config.tolerated_error))[:, 0] + _SPARE
         worst = value.topk(min(_POOL, len(value)))
-        return z[worst.indices[worst.values > -0.01]]
+        return z[worst.indices[worst.values > -_NEARLY]]
 
 
 class Settle(Tighten):

@@ -95,7 +95,7 @@ def watch(
     _check(env, video, policy, protect, record, port, steps, fps, noise)
     training = training_directory(name)
     if training is not None:
-        _check_training(training, acts=env is not None or video is not None or policy != "own" or protect or record is not None)
+        _check_training(training, env, video, policy, protect, record)
         return watch_training(training, host=host, port=port, changes=steps, ready=ready)
     monitor = Monitor.load(name)
     agent = monitor.agent
@@ -133,9 +133,11 @@ def watch(
     return view.counts
 
 
-def _check_training(directory: Path, acts: bool) -> None:
-    """A ConfigError if something is asked for that acts."""
-    if acts:
+def _check_training(
+    directory: Path, env: str | None, video: str | Path | None, policy: str, protect: bool, record: str | Path | None
+) -> None:
+    """A ConfigError if something is asked for that an agent would have to do."""
+    if env is not None or video is not None or policy != "own" or protect or record is not None:
         raise ConfigError(
             f"expected no env, video, policy, filter or record with a training, received one; '{directory}' has no calibrated agent that "
             "could act yet: `sspl calibrate` makes one of a run that has ended"
