@@ -38,6 +38,17 @@ class Back(Policy):
         return -self.action_scale * latent.sign()
 
 
+class Pushes(Policy):
+    """The same action everywhere."""
+
+    def __init__(self, action: float) -> None:
+        super().__init__(1, 1)
+        self.action = action
+
+    def forward(self, latent: Tensor) -> Tensor:
+        return torch.full_like(latent, self.action)
+
+
 class Shown(nn.Module):
     """Latents with these first entries, one after the other, whatever is seen."""
 
@@ -49,13 +60,13 @@ class Shown(nn.Module):
         return torch.tensor([[next(self.first), 0.0, 0.0]])
 
 
-def line(error: float = 0.01) -> Agent:
+def line(error: float = 0.01, own: Policy | None = None) -> Agent:
     """On a line, B(z) = z - 0.5, actions of at most 1."""
     barrier = nn.Sequential(nn.Linear(1, 1))
     with torch.no_grad():
         barrier[0].weight.fill_(1.0)
         barrier[0].bias.fill_(-0.5)
-    return Agent(nn.Identity(), Moves(1, 1), barrier, Back(1, 1), 1.0, {"tolerated_error": error}, 0.5)
+    return Agent(nn.Identity(), Moves(1, 1), barrier, own or Back(1, 1), 1.0, {"tolerated_error": error}, 0.5)
 
 
 def shield(**options: Any) -> Shield:
@@ -93,6 +104,28 @@ def test_a_lower_level_acts_earlier_and_blending_goes_the_agents_way():
 
 def test_where_no_action_keeps_the_lower_level_it_is_the_agents_own():
     assert float(shield(level=-0.3)(torch.tensor([[0.45]]), torch.tensor([[1.0]])).action) == -1.0
+
+
+@pytest.mark.parametrize(
+    ("own", "wanted", "taken"),
+    [
+        (-0.2, -0.2, -0.2),  # the agent's own, to B = -.07, though the level is not kept
+        (-0.2, -0.4, -0.4),  # better than that
+        (-0.2, 1.0, -0.2),
+        (0.4, 0.4, 0.4),  # the agent's own, to B = -.01, less than the margin inside: [V] speaks of no other action
+        (0.4, 0.35, 0.3),
+    ],
+)
+def test_no_more_is_asked_of_an_action_than_of_the_agents_own(own, wanted, taken):
+    protect = Shield(line(own=Pushes(own)), level=-0.3, margin=0.02)
+    found = protect(torch.tensor([[0.45]]), torch.tensor([[wanted]]))
+    assert float(found.action) == pytest.approx(taken, abs=2e-3)
+    assert bool(found.intervened) == (wanted != taken)
+
+
+def test_where_no_action_keeps_the_margin_it_is_the_agents_own():
+    protect = Shield(line(own=Pushes(0.4)), level=0.0, margin=0.2)  # -1 leads to B = -.15
+    assert float(protect(torch.tensor([[0.45]]), torch.tensor([[1.0]])).action) == pytest.approx(0.4)
 
 
 def test_rows_do_not_mix():

@@ -38,20 +38,22 @@ class Shield:
     r"""Lets actions through that surely keep the set, and takes near ones that do in place of the others.
 
     .. math::
-        u' = \begin{cases} u & B(d(\hat z, u)) + \eta \le s \\ \arg\min_{v \in V,\; B(d(\hat z, v)) + \eta \le s}
+        u' = \begin{cases} u & B(d(\hat z, u)) + \eta \le s' \text{ or } u = \pi(\hat z) \\ \arg\min_{v \in V,\; B(d(\hat z, v)) + \eta \le s'}
         \lVert (v - u) / u_{\max} \rVert & \text{else} \\ \pi(\hat z) & \text{where no } v \in V \text{ does, or } B(\hat z) > 0
         \end{cases}
+        \qquad s' = \max(s, \min(B(d(\hat z, \pi(\hat z))) + \eta, 0))
 
     with :math:`\eta = L_B \delta + 2 \epsilon_B`, the error that the set is proved to tolerate and what the barrier's evaluation
     may round off, and V a grid over all actions together with the way from u to :math:`\pi(\hat z)`; what is left of the way from u is
-    halved a few times. That :math:`\pi(\hat z)` keeps the set is what [V] says (Theorem G in ``docs/theory.md``). Source: none
-    (least-restrictive filters of model-based control, on latents).
+    halved a few times. That :math:`\pi(\hat z)` keeps the set is what [V] says (Theorem G in ``docs/theory.md``), so nothing better
+    than it is asked for: the agent's own actions are never changed. Source: none (least-restrictive filters of model-based control,
+    on latents).
 
     Args:
         agent: frozen agent with a tolerated error, so that [V] is proved.
         mode: ``"nearest"``, or ``"blend"``: V is the way to :math:`\pi(\hat z)` alone, which changes smoothly with u.
-        level: s <= 0: actions have to keep :math:`\{B \le s\}`, so that the filter acts before the border. A policy that is held at
-            the border of :math:`\{B \le 0\}` meets corrections that are cut again and again, and the memory goes astray.
+        level: s <= 0: actions have to keep :math:`\{B \le s\}` where the agent's own do, so that the filter acts before the border.
+            A policy that is held at the border of :math:`\{B \le 0\}` meets corrections that are cut again and again, and the memory goes astray.
         margin: :math:`\eta` in place of the proved one, for an agent without a proof: then nothing is guaranteed.
 
     Raises:
@@ -96,18 +98,21 @@ class Shield:
         scale = self.scale.to(wanted)
         asked = wanted.clamp(-scale, scale)
         own, inside = self.agent.policy(latent), self.agent.barrier(latent)[:, 0] <= 0.0
-        taken = torch.where((inside & (self._margin(latent, asked) >= 0.0))[:, None], asked, own)
-        rows = (inside & (self._margin(latent, asked) < 0.0)).nonzero()[:, 0]
+        most = self._after(latent, own).clamp(self.level - self.margin, -self.margin)
+        keeps = (self._after(latent, asked) <= most) | (asked == own).all(1)  # [V] speaks of the agent's own
+        taken = torch.where((inside & keeps)[:, None], asked, own)
+        rows = (inside & ~keeps).nonzero()[:, 0]
         if len(rows):
-            taken[rows] = self._near(latent[rows], asked[rows], own[rows])
+            taken[rows] = self._near(latent[rows], asked[rows], own[rows], most[rows])
         change = (taken - wanted) / scale
-        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self._margin(latent, taken))
+        margin = self.level - self.margin - self._after(latent, taken)
+        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), margin)
 
-    def _margin(self, latent: Tensor, action: Tensor) -> Tensor:
-        """``(n,)`` by how much successors are surely inside."""
-        return self.level - self.margin - self.agent.barrier(self.agent.dynamics(latent, action))[:, 0]
+    def _after(self, latent: Tensor, action: Tensor) -> Tensor:
+        """``(n,)`` barrier values of successors."""
+        return self.agent.barrier(self.agent.dynamics(latent, action))[:, 0]
 
-    def _near(self, latent: Tensor, asked: Tensor, own: Tensor) -> Tensor:
+    def _near(self, latent: Tensor, asked: Tensor, own: Tensor, most: Tensor) -> Tensor:
         """The nearest actions tried that keep the set; the agent's own ones where none does."""
         n, m = asked.shape
         share = torch.linspace(0.0, 1.0, _LINE + 1, device=asked.device)[1:, None]
@@ -115,14 +120,14 @@ class Shield:
         if self.mode == "nearest" and len(self.grid):
             tried = torch.cat([tried, self.grid.to(asked).expand(n, -1, m)], 1)
         k = tried.shape[1]
-        keeps = self._margin(latent.repeat_interleave(k, 0), tried.reshape(-1, m)).reshape(n, k) >= 0.0
+        keeps = self._after(latent.repeat_interleave(k, 0), tried.reshape(-1, m)).reshape(n, k) <= most[:, None]
         distance = ((tried - asked[:, None]) / self.scale.to(asked)).norm(dim=-1).masked_fill(~keeps, float("inf"))
         best = tried[torch.arange(n), distance.argmin(1)]
         found = keeps.any(1, keepdim=True)
         kept, lost = torch.ones(n, 1, device=asked.device), torch.zeros(n, 1, device=asked.device)
         for _ in range(_HALVINGS):
             middle = (kept + lost) / 2
-            good = (self._margin(latent, torch.lerp(asked, best, middle)) >= 0.0)[:, None]
+            good = (self._after(latent, torch.lerp(asked, best, middle)) <= most)[:, None]
             kept, lost = torch.where(good, middle, kept), torch.where(good, lost, middle)
         return torch.where(found, torch.where(kept < 1.0, torch.lerp(asked, best, kept), best), own)
 
