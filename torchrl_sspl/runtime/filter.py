@@ -98,15 +98,16 @@ class Shield:
         scale = self.scale.to(wanted)
         asked = wanted.clamp(-scale, scale)
         own, inside = self.agent.policy(latent), self.agent.barrier(latent)[:, 0] <= 0.0
-        most = self._after(latent, own).clamp(self.level - self.margin, -self.margin)
-        keeps = (self._after(latent, asked) <= most) | (asked == own).all(1)  # [V] speaks of the agent's own
-        taken = torch.where((inside & keeps)[:, None], asked, own)
+        after_own, after = self._after(latent.repeat(2, 1), torch.cat([own, asked])).chunk(2)
+        most = after_own.clamp(self.level - self.margin, -self.margin)
+        keeps = inside & ((after <= most) | (asked == own).all(1))  # [V] speaks of the agent's own
+        taken, after = torch.where(keeps[:, None], asked, own), torch.where(keeps, after, after_own)
         rows = (inside & ~keeps).nonzero()[:, 0]
         if len(rows):
             taken[rows] = self._near(latent[rows], asked[rows], own[rows], most[rows])
+            after[rows] = self._after(latent[rows], taken[rows])
         change = (taken - wanted) / scale
-        margin = self.level - self.margin - self._after(latent, taken)
-        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), margin)
+        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self.level - self.margin - after)
 
     def _after(self, latent: Tensor, action: Tensor) -> Tensor:
         """``(n,)`` barrier values of successors."""
