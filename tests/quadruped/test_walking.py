@@ -11,7 +11,7 @@ pytest.importorskip("pybullet")
 pytest.importorskip("daqp")
 from torchrl_sspl.envs.quadruped.controller import check_command
 from torchrl_sspl.envs.quadruped.gait import PERIOD
-from torchrl_sspl.envs.quadruped.kinematics import SHOULDER, forward_kinematics, inverse_kinematics
+from torchrl_sspl.envs.quadruped.kinematics import SHOULDER, cross, forward_kinematics, inverse_kinematics
 from torchrl_sspl.envs.quadruped.robot import WalkingRobot
 from torchrl_sspl.envs.quadruped.world import connect
 from torchrl_sspl.errors import NonFiniteError, ShapeError
@@ -30,6 +30,13 @@ def robot():
 @pytest.fixture(scope="module")
 def gait(robot):
     return robot.steady_gait()
+
+
+def test_products_of_vectors_are_those_of_numpy():
+    rng = np.random.default_rng(0)
+    a, b = rng.normal(size=3), rng.normal(size=(4, 3))
+    assert np.array_equal(cross(a, b), np.cross(a, b))
+    assert np.array_equal(cross(a, b[0]), np.cross(a, b[0]))
 
 
 def test_inverse_kinematics_undo_forward_kinematics():

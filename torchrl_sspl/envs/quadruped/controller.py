@@ -12,6 +12,7 @@ from torchrl_sspl.envs.quadruped.kinematics import (
     TOE_RADIUS,
     Array,
     Mask,
+    cross,
     forward_kinematics,
     inverse_kinematics,
     rotation_z,
@@ -159,7 +160,7 @@ class WalkingController:
             progress = np.where(standing, 0.0, (phase - gait.DUTY) / (1 - gait.DUTY))
             position, velocity = gait.swing(lift_off, footholds, progress)
             away = position - measured.position
-            velocity = (velocity - measured.velocity - np.cross(measured.angular_velocity, away)) @ rotation
+            velocity = (velocity - measured.velocity - cross(measured.angular_velocity, away)) @ rotation
             joints = inverse_kinematics(away @ rotation)
             speeds = np.clip(_solve(jacobians, velocity), -_MAX_JOINT_SPEED, _MAX_JOINT_SPEED)
             torque = _STIFFNESS * (joints - measured.joints) + _DAMPING * (speeds - measured.joint_velocities)
@@ -175,7 +176,7 @@ class WalkingController:
         arm = measured.rotation @ self.body.centre
         centre = measured.position + arm
         turn = rotation_z(angles[2])
-        velocity = measured.velocity + np.cross(measured.angular_velocity, arm)
+        velocity = measured.velocity + cross(measured.angular_velocity, arm)
         state = np.concatenate(
             [angles[:2], [0.0, 0.0, 0.0, centre[2]], measured.angular_velocity @ turn, velocity @ turn]
         )

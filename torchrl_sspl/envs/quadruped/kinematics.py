@@ -79,6 +79,23 @@ def rotation_z(angle: float) -> Array:
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
+def cross(a: Array, b: Array) -> Array:
+    """Products ``a x b`` ``(*batch, 3)`` of one vector ``(3,)`` with others ``(*batch, 3)``.
+
+    To the bit ``np.cross``, whose checks of shapes cost ten times as much as its products.
+
+    Example:
+        >>> cross(np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])).tolist()
+        [0.0, 0.0, 1.0]
+    """
+    x, y, z = a
+    out = np.empty_like(b)
+    out[..., 0] = y * b[..., 2] - z * b[..., 1]
+    out[..., 1] = z * b[..., 0] - x * b[..., 2]
+    out[..., 2] = x * b[..., 1] - y * b[..., 0]
+    return out
+
+
 def skew(vectors: Array) -> Array:
     """Cross-product matrices ``(*batch, 3, 3)`` of vectors ``(*batch, 3)``: ``skew(a) @ b = a x b``."""
     out = np.zeros((*vectors.shape, 3))

@@ -9,7 +9,15 @@ import numpy as np
 
 from torchrl_sspl.envs.quadruped.controller import Body, Measurement, Memory, WalkingController
 from torchrl_sspl.envs.quadruped.gait import GRAVITY, HEIGHT, PERIOD
-from torchrl_sspl.envs.quadruped.kinematics import LEGS, SHOULDER, TOE_RADIUS, Array, inverse_kinematics, rotation_z
+from torchrl_sspl.envs.quadruped.kinematics import (
+    LEGS,
+    SHOULDER,
+    TOE_RADIUS,
+    Array,
+    cross,
+    inverse_kinematics,
+    rotation_z,
+)
 from torchrl_sspl.envs.quadruped.mpc import Solver, solve_daqp
 from torchrl_sspl.envs.quadruped.world import add_ground, add_robot
 
@@ -121,7 +129,7 @@ class WalkingRobot:
         client.resetBasePositionAndOrientation(
             self.body_id, (state.position + offset).tolist(), _quaternion(turned).tolist()
         )
-        velocity = state.velocity + np.cross(state.angular_velocity, offset)
+        velocity = state.velocity + cross(state.angular_velocity, offset)
         client.resetBaseVelocity(self.body_id, velocity.tolist(), state.angular_velocity.tolist())
         for joint, angle, speed in zip(
             self._joints, state.joints.ravel().tolist(), state.joint_velocities.ravel().tolist(), strict=True
@@ -142,7 +150,7 @@ class WalkingRobot:
         return Measurement(
             np.array(position) - offset,
             rotation,
-            np.array(velocity) - np.cross(angular, offset),
+            np.array(velocity) - cross(angular, offset),
             angular,
             np.array([s[0] for s in states]).reshape(4, 3),
             np.array([s[1] for s in states]).reshape(4, 3),
