@@ -286,6 +286,21 @@ def test_a_barrier_that_hovers_hides_no_events(scale, tmp_path):
     assert (code, "RECORD_CHANGED" in text) == (Exit.REFUSED, True), text
 
 
+def test_where_a_search_gave_up_the_rest_is_compared_all_the_same(tmp_path):
+    agent, env = line_agent(), Line(law=lambda x: torch.full_like(x, 0.50002))
+    agent.barrier[-1].weight.data.mul_(1e-6)  # flatter than the slack by which bounds decide
+    agent.barrier[-1].bias.data.mul_(1e-6)
+    agent.save(tmp_path)
+    certify(agent, None, name="line", level=0.0, budget=Budget(boxes=500)).save(tmp_path / "certificate.json")
+    body = read(tmp_path)
+    assert statement(body, "invariance")["reason"] == "UNDECIDED"
+    assert verify(tmp_path, env=env)[0] == Exit.HOLDS
+    to("Lipschitz constant", value=0.5 * statement(body, "Lipschitz constant")["value"])(body)
+    write(tmp_path, body)
+    code, text = verify(tmp_path, env=env)
+    assert (code, "NUMBERS_CHANGED" in text) == (Exit.REFUSED, True), text
+
+
 # --- the agent changed under its certificate --------------------------------------------------------------------------------
 
 

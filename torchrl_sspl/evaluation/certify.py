@@ -460,8 +460,10 @@ def _verify(
 
     # Where a search is said to have given up, as much effort is enough to see that nothing more is claimed.
     given_up = effort(claimed.layers["deterministic"])
-    if not given_up or compared(proved(given_up)):
-        _refuse(compared(_proof(agent, claimed.level, budget)))
+    found = compared(proved(given_up)) if given_up else {Reason.UNDECIDED: ""}
+    if set(found) == {Reason.UNDECIDED}:
+        found = compared(_proof(agent, claimed.level, budget))
+    _refuse(found)
     left = math.inf if measure else min(_SAMPLE, seconds / 3, seconds - (time.monotonic() - began))
     measured = _measured_again(claimed, agent, env, measure, left)
     _print(claimed, measured, report)
