@@ -9,7 +9,7 @@ import torch
 
 from torchrl_sspl.baselines import BUDGETS, ScoreConfig, make, score
 from torchrl_sspl.baselines.ceilings import collision_cone
-from torchrl_sspl.baselines.score import adversarial, barrier_on, calibrated_level, harmless, well_inside
+from torchrl_sspl.baselines.scoring import adversarial, barrier_on, calibrated_level, harmless, well_inside
 from torchrl_sspl.envs import DubinsEnv, GymnasiumPixels, PendulumEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation import simulate

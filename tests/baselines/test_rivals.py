@@ -15,7 +15,7 @@ from torchrl_sspl.baselines.nerf_cbf import NeRFCBF
 from torchrl_sspl.baselines.neural_cbf import QuadraticBarrier
 from torchrl_sspl.baselines.perception import Coordinates, Perception, perception_error
 from torchrl_sspl.baselines.registry import kind_of
-from torchrl_sspl.baselines.score import adversarial, harmless, well_inside
+from torchrl_sspl.baselines.scoring import adversarial, harmless, well_inside
 from torchrl_sspl.baselines.vision_cbf import Geometry
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.errors import ConfigError, ShapeError

@@ -8,7 +8,7 @@ from __future__ import annotations
 from torchrl_sspl.baselines.base import BUDGETS, Budget, Guarded, Needs, OneStepFilter, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, record
 from torchrl_sspl.baselines.registry import METHODS, make
-from torchrl_sspl.baselines.score import ScoreConfig, score
+from torchrl_sspl.baselines.scoring import ScoreConfig, score
 
 __all__ = [
     "BUDGETS", "Budget", "Guarded", "METHODS", "Needs", "OneStepFilter", "Recording", "SafetyMethod", "ScoreConfig", "make",

@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from torchrl_sspl.baselines.base import BUDGETS
 from torchrl_sspl.baselines.data import Recording, record
 from torchrl_sspl.baselines.registry import kind_of, make
-from torchrl_sspl.baselines.score import ScoreConfig, score, sizes_of
+from torchrl_sspl.baselines.scoring import ScoreConfig, score, sizes_of
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, OutputError
