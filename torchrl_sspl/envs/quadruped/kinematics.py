@@ -89,7 +89,7 @@ def cross(a: Array, b: Array) -> Array:
         [0.0, 0.0, 1.0]
     """
     x, y, z = a
-    out = np.empty_like(b)
+    out = np.empty(b.shape)
     out[..., 0] = y * b[..., 2] - z * b[..., 1]
     out[..., 1] = z * b[..., 0] - x * b[..., 2]
     out[..., 2] = x * b[..., 1] - y * b[..., 0]
