@@ -25,6 +25,7 @@ PURPOSES = {
     "report": 12,  # figures and films
     "benchmark": 13,
     "monitor": 14,  # clean episodes by which the monitor is calibrated
+    "pictures": 15,  # changes of what cameras see
 }
 _INDICES = 1 << 24
 _MASK = 0xFFFF_FFFF

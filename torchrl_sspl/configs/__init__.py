@@ -2,6 +2,7 @@
 
 from torchrl_sspl.configs.reader import EnvFactory, compose, load, save
 from torchrl_sspl.configs.schema import (
+    AugmentationConfig,
     BufferConfig,
     CollectorConfig,
     Config,
@@ -15,6 +16,6 @@ from torchrl_sspl.configs.schema import (
 )
 
 __all__ = [
-    "BufferConfig", "CollectorConfig", "Config", "EnvFactory", "EvaluationConfig", "LoggerConfig", "LossConfig",
+    "AugmentationConfig", "BufferConfig", "CollectorConfig", "Config", "EnvFactory", "EvaluationConfig", "LoggerConfig", "LossConfig",
     "NetworkConfig", "OptimConfig", "SynthesisConfig", "TrainerConfig", "compose", "load", "save",
 ]  # fmt: skip

@@ -111,6 +111,16 @@ class BufferConfig:
 
 
 @dataclass
+class AugmentationConfig:
+    """Changes of the pictures that should not matter, one camera for each episode of the training."""
+
+    share: float = _option(0.0, "chance of each of them in an episode (0: off).")
+    noise: float = _option(12.0, "largest standard deviation of noise, grey levels of 255.")
+    brightness: float = _option(0.15, "largest change of the brightness, as a share of it.")
+    shift: float = _option(1.0, "largest shift of the camera along each axis, pixels of 64.")
+
+
+@dataclass
 class OptimConfig:
     """The optimiser of the joint training (Adam)."""
 
@@ -263,6 +273,7 @@ class Config:
     loss: LossConfig = _option(LossConfig, "the total loss.")
     collector: CollectorConfig = _option(CollectorConfig, "where transitions come from.")
     buffer: BufferConfig = _option(BufferConfig, "store of transitions.")
+    augmentation: AugmentationConfig = _option(AugmentationConfig, "changes of the pictures.")
     optim: OptimConfig = _option(OptimConfig, "optimiser of the joint training.")
     trainer: TrainerConfig = _option(TrainerConfig, "joint training.")
     synthesis: SynthesisConfig = _option(SynthesisConfig, "phases on frozen latents.")
@@ -323,6 +334,6 @@ class Config:
 
 
 __all__ = [
-    "BufferConfig", "CollectorConfig", "Config", "EvaluationConfig", "LoggerConfig", "LossConfig", "NetworkConfig",
+    "AugmentationConfig", "BufferConfig", "CollectorConfig", "Config", "EvaluationConfig", "LoggerConfig", "LossConfig", "NetworkConfig",
     "OptimConfig", "PRESETS", "SynthesisConfig", "TrainerConfig",
 ]

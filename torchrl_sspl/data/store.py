@@ -12,6 +12,7 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data.replay_buffers import RoundRobinWriter, Sampler, Storage, TensorDictReplayBuffer
 
+from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.data.frames import FrameBank
 from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, EmptyRegionError, ShapeError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
@@ -42,6 +43,7 @@ class TransitionStore(Storage):
         capacity: largest number of transitions.
         pixel_views: hand out the observations beside the frames.
         keep_state: keep the true states, for evaluation.
+        augmentation: changes frames before they are stored; transitions that follow each other share a camera.
 
     Raises ConfigError if ``capacity`` is not a positive integer. Source: the data sets D, S, U of the paper (Section
     IV): S and U are the labelled part of D, not copies.
@@ -59,11 +61,13 @@ class TransitionStore(Storage):
         torch.Size([4, 3, 3, 8, 8])
     """
 
-    def __init__(self, capacity: int, *, pixel_views: bool = False, keep_state: bool = False) -> None:
+    def __init__(
+        self, capacity: int, *, pixel_views: bool = False, keep_state: bool = False, augmentation: Augmentation | None = None
+    ) -> None:
         if not isinstance(capacity, int) or capacity < 1:
             raise ConfigError(f"capacity: expected an integer >= 1, received {capacity!r}.")
         super().__init__(capacity)
-        self.pixel_views, self.keep_state = pixel_views, keep_state
+        self.pixel_views, self.keep_state, self.augmentation = pixel_views, keep_state, augmentation
         self.device = torch.device("cpu")
         self._len = self._cursor = 0
         self._bank = FrameBank(1)
@@ -134,7 +138,7 @@ class TransitionStore(Storage):
         if triples is not None:
             old = triples[index]
             self._bank.hold(old[old[:, 0] >= 0], -1)
-        columns["triple"] = self._store_frames(now, then)
+        columns["triple"] = self._store_frames(now, then, int(index[0]))
         for name, rows in columns.items():
             if name not in self._columns:
                 self._columns[name] = _column(name, rows, self.max_size)
@@ -143,7 +147,7 @@ class TransitionStore(Storage):
         self._by_region = {}
         self._bump_mutation_revision()
 
-    def _store_frames(self, now: Tensor, then: Tensor) -> Tensor:
+    def _store_frames(self, now: Tensor, then: Tensor, position: int) -> Tensor:
         """Store the frames of transitions, each once; returns the frame numbers ``(n, 3)``."""
         linked = torch.zeros(now.shape[0], dtype=torch.bool)
         linked[1:] = (now[1:] == then[:-1]).flatten(1).all(1)
@@ -153,9 +157,12 @@ class TransitionStore(Storage):
         slots = self._bank.reserve(int(end[-1]), now.shape[2:])
         triple = slots[end[:, None] + torch.tensor([-3, -2, -1])]
         first = triple[~linked]
-        self._bank.write(first[:, 0], now[~linked, :3])
-        self._bank.write(first[:, 1], now[~linked, 3:])
-        self._bank.write(triple[:, 2], then[:, 3:])
+        places = torch.cat([first[:, 0], first[:, 1], triple[:, 2]])
+        frames = torch.cat([now[~linked, :3], now[~linked, 3:], then[:, 3:]])
+        if self.augmentation is not None:
+            episode = (~linked).cumsum(0) - 1
+            frames = self.augmentation(frames, torch.cat([episode[~linked], episode[~linked], episode]), position)
+        self._bank.write(places, frames)
         self._bank.hold(triple, +1)
         return triple
 

@@ -25,7 +25,7 @@ from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.configs.schema import Config
-from torchrl_sspl.data import TransitionStore
+from torchrl_sspl.data import Augmentation, TransitionStore
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions, make_collector
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import SafetyEnv
@@ -128,7 +128,10 @@ class Experiment:
         self.loss = self._loss(self.encoder, self.dynamics, self.barrier, self.policy)
         self.logger = make_logger(config.logger.kind, config.logger.kind, self.directory, project=config.logger.project)
         # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
-        self.store = TransitionStore(config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"))
+        self.augmentation = Augmentation(**vars(config.augmentation), seed=config.seed) if config.augmentation.share else None
+        self.store = TransitionStore(
+            config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=self.augmentation
+        )
         self.work = self._workspace()
         self.phases = Phases(agent_phases(config, known=self.known), self.work)
         self.trainer = self._make_trainer()
@@ -195,7 +198,7 @@ class Experiment:
         source = Source(
             self.make_env, self.encoder, store=self.store, starts=c.starts,
             steps=self.config.synthesis.episode_steps or c.max_frames_per_traj,
-            envs=256 if self.known else c.envs, seed=seed,
+            envs=256 if self.known else c.envs, seed=seed, augmentation=self.augmentation,
         )  # fmt: skip
         body = self.config.to_dict()
         body.pop("out_dir")

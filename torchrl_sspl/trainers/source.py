@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from torchrl_sspl.data import TransitionStore, collect_random, collect_rollouts
+from torchrl_sspl.data import Augmentation, TransitionStore, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.data.store import continues
 from torchrl_sspl.direction import direction_of
@@ -62,6 +62,7 @@ class Source:
         steps: longest episode under random actions; ``None`` leaves that to the environment.
         envs: environments stepped together.
         seed: seed of all collections.
+        augmentation: changes the pictures of what is collected anew; the store's are as they are.
 
     Source: paper Algorithm 1 (D grows by rollouts of the policy); deviation: labels of the rollouts are used too.
     """
@@ -76,9 +77,10 @@ class Source:
         steps: int | None = 4,
         envs: int = 256,
         seed: int = 0,
+        augmentation: Augmentation | None = None,
     ) -> None:
         self.make_env, self.encoder, self.store = make_env, getattr(encoder, "module", encoder), store
-        self.starts, self.steps, self.envs, self.seed = list(starts), steps, envs, seed
+        self.starts, self.steps, self.envs, self.seed, self.augmentation = list(starts), steps, envs, seed, augmentation
         self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
 
     @cached_property
@@ -127,9 +129,9 @@ class Source:
             steps: longest episode, in place of the source's.
         """
 
-        def draw(env: EnvBase, size: int, seed: int) -> TransitionStore:
+        def draw(env: EnvBase, store: TransitionStore, seed: int) -> None:
             where = region or (starts_of(env, self.starts) if isinstance(env, SafetyEnv) else None)
-            return collect_random(env, size, seed=seed, steps=steps or self.steps, region=where)
+            collect_random(env, store.max_size, seed=seed, steps=steps or self.steps, region=where, store=store)
 
         return self._in_chunks(draw, n, index)
 
@@ -160,13 +162,13 @@ class Source:
         bounds = space.low.cpu().float(), space.high.cpu().float()
         exploring = ExploringPolicy(acting, *bounds, exploration, 0.0, predict).to(device)
 
-        def draw(env: EnvBase, size: int, seed: int) -> TransitionStore:
+        def draw(env: EnvBase, store: TransitionStore, seed: int) -> None:
             devices: dict[str, Any] = {}
             if device.type != "cpu":
                 devices = {"policy_device": device, "env_device": "cpu", "storing_device": "cpu"}
             with torch.random.fork_rng():
                 torch.manual_seed(seed)
-                return collect_rollouts(env, exploring, size, seed=seed, steps=steps, region=region, **devices)
+                collect_rollouts(env, exploring, store.max_size, seed=seed, steps=steps, region=region, store=store, **devices)
 
         try:
             return self._in_chunks(draw, n, index, envs=max(1, _CHUNK // (steps or 1)))
@@ -174,13 +176,16 @@ class Source:
             policy.cpu()
 
     def _in_chunks(
-        self, draw: Callable[[EnvBase, int, int], TransitionStore], n: int, index: int, envs: int = _CHUNK
+        self, draw: Callable[[EnvBase, TransitionStore, int], None], n: int, index: int, envs: int = _CHUNK
     ) -> Latents:
         env = self.make_env(batch_size=[min(self.envs, n, envs)], seed=self.seed)
         parts = list[Latents]()
         for k, size in enumerate(c.numel() for c in torch.arange(n).split(_CHUNK)):
-            store = draw(env, size, spawn(self.seed, "rounds", 1000 * index + k))
-            store.pixel_views = not hasattr(self.encoder, "sequence")
+            seed, changes = spawn(self.seed, "rounds", 1000 * index + k), copy.copy(self.augmentation)
+            if changes is not None:
+                changes.seed = seed
+            store = TransitionStore(size, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=changes)
+            draw(env, store, seed)
             self.count(store)
             parts.append(self._encode(store, torch.arange(len(store))))
         if not isinstance(env, SafetyEnv):
