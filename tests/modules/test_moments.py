@@ -8,12 +8,14 @@ import math
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional as F
 
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError
 from torchrl_sspl.modules import BearingEncoder, LatentDynamics, MomentEncoder, Policy, ShapeEncoder
 from torchrl_sspl.modules.agent import Agent, mlp_barrier
+from torchrl_sspl.modules.moments import Bearing
 
 
 @pytest.fixture(scope="module")
@@ -169,10 +171,36 @@ def test_a_bearing_does_not_change_when_robot_and_obstacle_turn_together(bearing
     moved = copy.deepcopy(bearing)
     moved.anchor.copy_(turn @ bearing.anchor)
     bearing.centres, moved.centres = (lambda c: c), (lambda c: turn @ c)
+    bearing.in_place = moved.in_place = lambda c: c
     try:
         assert torch.allclose(moved(centres)[:, :2], bearing(centres)[:, :2], atol=1e-5)
     finally:
-        del bearing.centres
+        del bearing.centres, bearing.in_place
+
+
+@pytest.mark.parametrize("by", [(1, -1), (-1, 0), (1, 1)])
+def test_a_camera_that_is_out_of_place_by_a_few_pixels_is_put_back(bearings, by):
+    env, encoder, states = bearings
+    bearing, frames = encoder.trunk[0], F.avg_pool2d(env.draw(states).float(), 2) / 127.5 - 1.0
+    shifted = frames.roll(by, (2, 3))
+    assert torch.equal(bearing.in_place(frames), frames)
+    assert torch.equal(bearing.in_place(shifted)[..., 1:-1, 1:-1], frames[..., 1:-1, 1:-1])
+    twin = BearingEncoder(**encoder.arguments)
+    twin.load_state_dict(encoder.state_dict())
+    assert torch.equal(twin.trunk[0].in_place(shifted), bearing.in_place(shifted))
+
+
+def test_noise_and_brightness_do_not_move_a_frame(bearings):
+    env, encoder, states = bearings
+    bearing, frames = encoder.trunk[0], F.avg_pool2d(env.draw(states).float(), 2) / 127.5 - 1.0
+    noisy = frames + 12.0 / 255.0 * torch.randn(frames.shape, generator=torch.Generator().manual_seed(0))
+    for changed in (noisy, 0.85 * (frames + 1.0) - 1.0, (1.15 * (frames + 1.0) - 1.0).clamp_max(1.0)):
+        assert torch.equal(bearing.in_place(changed), changed)
+
+
+def test_where_nothing_stands_still_no_frame_is_moved():
+    frames = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
+    assert torch.equal(Bearing(32).in_place(frames), frames)
 
 
 def test_entries_that_no_picture_shows_are_zero_and_the_encoder_survives_disk(bearings):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +14,8 @@ from torchrl_sspl.modules.networks import FrameEncoder, mlp
 
 _NOISE = 0.05  # difference in [-1, 1] that is not seen
 _FAINT = 0.15  # the same of a bearing: the noise of a bad camera
+_REACH = 1.5  # pixels of 64 by which a camera may be out of place
+_EDGE = 16  # of a frame's width: so many pixels have to speak for it
 _VAGUE = 0.03  # scaled length below which a direction is none
 _WHOLE = 0.9  # of the usual covered share, from which a thing is seen as a whole
 
@@ -277,7 +280,8 @@ class Bearing(nn.Module):
 
     with the centres :math:`c_\pm` of the weights :math:`w_\pm` on plain ground. What a camera's noise changes is no thing
     (:math:`\epsilon`), nor are another brightness (:math:`\kappa_k` makes the plain ground as bright as it was) and edges of the
-    background that a camera shifted by a pixel moves (only plain ground counts). Where the ends of what moves differ in colour,
+    background that a camera shifted by a pixel moves (only plain ground counts). A camera that is out of place by up to one and a half
+    pixels of 64 is put back by whole pixels, to where most of what has the still thing's colour lies on it. Where the ends of what moves differ in colour,
     e points from one to the other: :math:`\alpha`, of sum zero, is the contrast of colours whose centres differ most. What is as dark in
     all colours, such as legs, counts nothing. The place q is the middle of what is not plain ground, the middle of the frame where all of it is. Background b and all statistics come
     from frames alone and are set by :meth:`fit`. Distances are in half widths of the frame. Source: none.
@@ -304,6 +308,9 @@ class Bearing(nn.Module):
     contrast: Tensor
     anchor: Tensor
     axis: Tensor
+    shifts: Tensor
+    colours: Tensor
+    places: Tensor
 
     def __init__(self, size: int, channels: int = 3) -> None:
         super().__init__()
@@ -313,6 +320,38 @@ class Bearing(nn.Module):
         self.register_buffer("contrast", torch.zeros(channels))
         self.register_buffer("anchor", torch.zeros(2))
         self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
+        reach = torch.arange(-int(_REACH * size / 64), int(_REACH * size / 64) + 1)
+        self.register_buffer("shifts", torch.cartesian_prod(reach, reach), persistent=False)  # down, to the right
+        self.register_buffer("colours", torch.ones(2, channels), persistent=False)  # of the still thing, and beside it
+        self.register_buffer("places", torch.zeros(len(self.shifts), size * size), persistent=False)  # 1 on it, -1 beside it
+        self._look()
+
+    def _look(self) -> None:
+        """Takes from the background what :meth:`in_place` compares frames with."""
+        beside = self.background.flatten(1).median(1).values
+        off = (self.background - beside[:, None, None]).abs().amax(0)
+        shape = off / off.max().clamp_min(_NOISE)
+        core = (shape > _WHOLE).float()
+        self.colours.copy_(torch.stack([(self.background * core).sum((1, 2)) / core.sum().clamp_min(1.0), beside]))
+        moved = [shape.roll((down, right), (0, 1)) for down, right in self.shifts.tolist()]
+        self.places.copy_(2.0 * torch.stack(moved).flatten(1) - 1.0)
+
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        super()._load_from_state_dict(*arguments)
+        self._look()
+
+    def in_place(self, frames: Tensor) -> Tensor:
+        """Frames ``(n, c, H, W)`` as a camera that is in its place sees them."""
+        thing, beside = self.colours
+        apart = (frames - thing[:, None, None]).square().sum(1).sqrt() / (thing - beside).norm().clamp_min(_NOISE)
+        like = (1.0 - 2.0 * apart).clamp_min(0.0)
+        still = (self.shifts == 0).all(1) * self.axis.numel() / _EDGE  # only what is seen clearly moves a frame
+        down, right = self.shifts[(like.flatten(1) @ self.places.T + still).argmax(1)].unbind(1)
+        size = len(self.axis)
+        pixels = torch.arange(size, device=frames.device)
+        rows, columns = ((pixels + by[:, None]).clamp(0, size - 1) for by in (down, right))
+        at = (size * rows[:, :, None] + columns[:, None, :]).flatten(1)[:, None].expand(-1, frames.shape[1], -1)
+        return frames.flatten(2).gather(2, at).reshape(frames.shape)
 
     def centres(self, frames: Tensor, mixed: Tensor | None = None) -> Tensor:
         """Centres ``(n, 2, m)`` of mixtures ``(m, c)`` of the colours of frames ``(n, c, H, W)``, by default of the two ends: in [-1, 1],
@@ -328,7 +367,8 @@ class Bearing(nn.Module):
     def fit(self, frames: Tensor) -> None:
         """Take everything from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(_background(frames))
-        off = (self.background - self.background.flatten(1).median(1).values[:, None, None]).abs().amax(0)
+        self._look()
+        off = (self.background - self.colours[1][:, None, None]).abs().amax(0)
         thing = torch.where(off > _NOISE, off, 0.0)
         self.anchor.copy_(torch.stack(_centre(thing, self.axis)))
         self.ground.copy_(1.0 - F.max_pool2d((thing > 0.0).float()[None], 3, 1, 1)[0])
@@ -342,7 +382,7 @@ class Bearing(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Place of the still thing, ahead and aside of the moving one, and e of length one: ``(n, 4)`` of frames ``(n, c, H, W)``."""
-        centres = _in_parts(self.centres, frames)
+        centres = _in_parts(lambda part: self.centres(self.in_place(part)), frames)
         ahead = centres[..., 0] - centres[..., 1]
         ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         away = self.anchor - centres.mean(-1)
