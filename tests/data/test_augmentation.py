@@ -98,6 +98,11 @@ def test_an_episode_that_is_stored_has_one_camera_and_every_frame_one_change():
     found = store.get(torch.arange(12))["frames"]
     assert store.n_frames == plain.n_frames
     assert torch.equal(found[:5, 1:], found[1:6, :2])
+    light = TransitionStore(12, augmentation=only("brightness", 0.5))
+    light.extend(data)
+    factor = (light.get(torch.arange(12))["frames"].float() / plain.get(torch.arange(12))["frames"]).reshape(2, -1)
+    assert float((factor - factor.mean(1, keepdim=True)).abs().max()) < 0.02
+    assert float(factor.mean(1).diff().abs()) > 0.05
     assert not torch.equal(found[:6], found[6:])
     assert not torch.equal(found, plain.get(torch.arange(12))["frames"])
 

@@ -183,11 +183,17 @@ def test_a_camera_that_is_out_of_place_by_a_few_pixels_is_put_back(bearings, by)
     env, encoder, states = bearings
     bearing, frames = encoder.trunk[0], F.avg_pool2d(env.draw(states).float(), 2) / 127.5 - 1.0
     shifted = frames.roll(by, (2, 3))
-    assert torch.equal(bearing.in_place(frames), frames)
     assert torch.equal(bearing.in_place(shifted)[..., 1:-1, 1:-1], frames[..., 1:-1, 1:-1])
     twin = BearingEncoder(**encoder.arguments)
     twin.load_state_dict(encoder.state_dict())
     assert torch.equal(twin.trunk[0].in_place(shifted), bearing.in_place(shifted))
+
+
+def test_a_robot_on_the_obstacle_does_not_move_a_frame(bearings):
+    env, encoder, _ = bearings
+    states = env.sample_states(1000, torch.Generator().manual_seed(1), region=env.unsafe_set)
+    frames = F.avg_pool2d(env.draw(states).float(), 2) / 127.5 - 1.0
+    assert torch.equal(encoder.trunk[0].in_place(frames), frames)
 
 
 def test_noise_and_brightness_do_not_move_a_frame(bearings):
@@ -199,8 +205,8 @@ def test_noise_and_brightness_do_not_move_a_frame(bearings):
 
 
 def test_where_nothing_stands_still_no_frame_is_moved():
-    frames = torch.rand(8, 3, 32, 32, generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
-    assert torch.equal(Bearing(32).in_place(frames), frames)
+    frames = torch.rand(8, 3, 64, 64, generator=torch.Generator().manual_seed(0)) * 2.0 - 1.0
+    assert torch.equal(Bearing(64).in_place(frames), frames)
 
 
 def test_entries_that_no_picture_shows_are_zero_and_the_encoder_survives_disk(bearings):

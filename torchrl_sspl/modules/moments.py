@@ -323,7 +323,7 @@ class Bearing(nn.Module):
         reach = torch.arange(-int(_REACH * size / 64), int(_REACH * size / 64) + 1)
         self.register_buffer("shifts", torch.cartesian_prod(reach, reach), persistent=False)  # down, to the right
         self.register_buffer("colours", torch.ones(2, channels), persistent=False)  # of the still thing, and beside it
-        self.register_buffer("places", torch.zeros(len(self.shifts), size * size), persistent=False)  # 1 on it, -1 beside it
+        self.register_buffer("places", torch.zeros(len(self.shifts), size * size), persistent=False)  # 1 on it
         self._look()
 
     def _look(self) -> None:
@@ -334,7 +334,7 @@ class Bearing(nn.Module):
         core = (shape > _WHOLE).float()
         self.colours.copy_(torch.stack([(self.background * core).sum((1, 2)) / core.sum().clamp_min(1.0), beside]))
         moved = [shape.roll((down, right), (0, 1)) for down, right in self.shifts.tolist()]
-        self.places.copy_(2.0 * torch.stack(moved).flatten(1) - 1.0)
+        self.places.copy_(torch.stack(moved).flatten(1))
 
     def _load_from_state_dict(self, *arguments: Any) -> None:
         super()._load_from_state_dict(*arguments)

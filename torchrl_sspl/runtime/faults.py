@@ -13,6 +13,8 @@ from torch.nn import functional as F
 
 from torchrl_sspl.errors import ConfigError
 
+_PART = 32  # frames that are floating point at a time
+
 #: By name, three strengths of what the fault takes as its number: harmless, plain, severe.
 FAULTS: dict[str, tuple[float, float, float]] = {
     "dark": (0.85, 0.4, 0.0),  # factor
@@ -79,12 +81,16 @@ class CameraFault:
         """A frame with the camera's own noise."""
         if not self.noise:
             return frame
-        return _noise(frame.float(), self.noise, self.generator, 0).round().clamp(0, 255).to(torch.uint8)
+        return self._made(_noise, frame, self.noise, 0)
 
     def _changed(self, frame: Tensor, t: int) -> Tensor:
         """A frame changed by itself."""
-        made = _OF_A_FRAME[self.name](frame.float(), self.strength, self.generator, t)
-        return made.round().clamp(0, 255).to(torch.uint8)
+        return self._made(_OF_A_FRAME[self.name], frame, self.strength, t)
+
+    def _made(self, change: Callable[[Tensor, float, torch.Generator, int], Tensor], frames: Tensor, strength: float, t: int) -> Tensor:
+        """Changed frames; of a few at a time, which stay in the cache."""
+        parts = (change(part.float(), strength, self.generator, t) for part in frames.split(_PART))
+        return torch.cat([part.round_().clamp_(0, 255).to(torch.uint8) for part in parts])
 
 
 def _noise(x: Tensor, s: float, g: torch.Generator, t: int) -> Tensor:
