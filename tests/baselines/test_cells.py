@@ -9,10 +9,11 @@ import torch
 
 from torchrl_sspl.baselines.__main__ import main
 from torchrl_sspl.baselines.base import BUDGETS, Budget, Needs
-from torchrl_sspl.baselines.cell import ROW_FILE, Cell, run_cell, text
+from torchrl_sspl.baselines.cell import ROW_FILE, Cell, run_cell, stored, text
 from torchrl_sspl.baselines.data import pooled, record
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, OutputError, ShapeError
+from torchrl_sspl.modules.agent import load
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 SMALL = ["score.episodes=20", "score.horizon=10", "score.grid=21", "score.kernel_grid=31", "score.frames=2"]
@@ -40,6 +41,18 @@ def test_another_row_is_never_overwritten(tmp_path):
         run_cell(Cell.of("hocbf", [where, *SMALL]))
     with pytest.raises(OutputError, match="choose another out_dir"):
         run_cell(Cell.of("lqr", [where, *SMALL[1:]]))
+
+
+def test_a_row_of_an_agent_with_other_weights_is_measured_again(tmp_path):
+    agent = load("pendulum")
+    agent.save(tmp_path / "agent")
+    cell = Cell.of("sspl", [f"agent={tmp_path / 'agent'}", f"out_dir={tmp_path}/row", *SMALL])
+    cell.directory.mkdir()
+    (cell.directory / ROW_FILE).write_text(json.dumps({"cell": cell.describe()}))
+    assert stored(cell) is not None
+    agent.barrier[-1].bias.data += 1.0
+    agent.save(tmp_path / "agent")
+    assert stored(cell) is None
 
 
 @pytest.mark.parametrize(

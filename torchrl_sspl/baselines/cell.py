@@ -7,6 +7,7 @@ import json
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, OutputError
 from torchrl_sspl.files import RunDirectory, write
+from torchrl_sspl.modules.agent import WEIGHTS_FILE, agent_directory
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
@@ -93,7 +95,9 @@ class Cell:
         """Plain values that determine the row; where it lies is not among them."""
         body = asdict(self)
         body.pop("out_dir")
-        return body | {"options": list(self.options)}
+        agents = [o.removeprefix("agent=") for o in self.options if o.startswith("agent=")]
+        weights = {"weights": sha256((agent_directory(a) / WEIGHTS_FILE).read_bytes()).hexdigest() for a in agents}
+        return body | {"options": list(self.options)} | weights
 
     def environment(self) -> SafetyEnv:
         """The system; a ConfigError if there is none of that name, or its dynamics are not known."""
@@ -104,7 +108,7 @@ class Cell:
 
 
 def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
-    """The row of a cell, if it has been written; OutputError if the directory holds another one.
+    """The row of a cell, if it has been written, of an agent with the same weights; OutputError if the directory holds another one.
 
     With ``any_score`` the sizes of its measurement do not matter. Source: none.
 
@@ -120,6 +124,8 @@ def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
     except ValueError as error:
         raise OutputError(f"expected a row in '{path}', received what cannot be read: {error}; remove it") from error
     found = row.get("cell") or {}
+    if found.get("weights") != cell.describe().get("weights"):
+        return None
     if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
         raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; choose another out_dir")
     return row
