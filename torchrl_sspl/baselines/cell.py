@@ -95,9 +95,10 @@ class Cell:
         """Plain values that determine the row; where it lies is not among them."""
         body = asdict(self)
         body.pop("out_dir")
-        agents = [o.removeprefix("agent=") for o in self.options if o.startswith("agent=")]
-        weights = {"weights": sha256((agent_directory(a) / WEIGHTS_FILE).read_bytes()).hexdigest() for a in agents}
-        return body | {"options": list(self.options)} | weights
+        body["options"] = list(self.options)
+        for agent in (o.removeprefix("agent=") for o in self.options if o.startswith("agent=")):
+            body["weights"] = sha256((agent_directory(agent) / WEIGHTS_FILE).read_bytes()).hexdigest()
+        return body
 
     def environment(self) -> SafetyEnv:
         """The system; a ConfigError if there is none of that name, or its dynamics are not known."""
