@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 from tiny import TINY
@@ -51,8 +52,8 @@ def test_every_phase_of_both_rounds_was_run(trained):
         assert {"dynamics", "fit", "steer", "tune", "check"} <= {row["phase"] for row in rows if row["round"] == k}
 
 
-def test_started_again_it_is_not_trained_again(program, trained, capsys):
-    _, directory = trained
+def test_started_again_it_is_not_trained_again(program, trained, tmp_path, capsys):
+    directory = shutil.copytree(trained[1], tmp_path / "again")
     weights, log = (directory / "agent" / "agent.safetensors").read_bytes(), (directory / "log.jsonl").read_bytes()
     assert program(EXAMPLE, *WORDS, *SMALL, "evaluation.renderer_episodes=0", f"out_dir={directory}") == 0
     assert (directory / "agent" / "agent.safetensors").read_bytes() == weights

@@ -310,20 +310,21 @@ class Count(Phase):
         self.seen = int(work.unsafe().sum())
 
 
-def test_phases_can_be_left_out_and_added_to(tmp_path, uninterrupted):
-    source = uninterrupted[0].work.source
+def test_phases_can_be_left_out_and_added_to(tmp_path):
+    found = experiment(tmp_path)
+    found.train()
     config = compose([*TINY, "synthesis.rounds=1"]).synthesis
     counted = Count()
     phases = [phase for phase in synthesis_phases(config) if phase.name not in ("steer", "tune")]
-    dynamics, barrier, policy = [m for m in (uninterrupted[0].dynamics, uninterrupted[0].barrier, uninterrupted[0].policy)]
-    before = {k: v.clone() for k, v in barrier.state_dict().items()}
-    work = Workspace(source.encoder, dynamics, barrier, policy, config=config, source=source)
+    before = {k: v.clone() for k, v in found.barrier.state_dict().items()}
+    source = found.work.source
+    work = Workspace(source.encoder, found.dynamics, found.barrier, found.policy, config=config, source=source)
     run = Phases([phases[0], counted, *phases[1:]], work)
     run.run()  # without any trainer
     assert run.finished
     assert counted.seen > 0
-    assert any(not torch.equal(before[k], v) for k, v in barrier.state_dict().items())  # the weights are back where they belong
-    barrier.load_state_dict(before)
+    after = found.barrier.state_dict()
+    assert any(not torch.equal(before[k], v) for k, v in after.items())  # the weights are back where they belong
 
 
 def test_where_U_is_never_seen_nothing_is_synthesised(tmp_path, monkeypatch):
