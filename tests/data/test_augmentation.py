@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -9,6 +11,7 @@ from tensordict import TensorDict
 from torchrl_sspl.configs import compose
 from torchrl_sspl.data import Augmentation, TransitionStore
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
+from torchrl_sspl.evaluation import known
 from torchrl_sspl.experiments import Experiment
 
 PLAIN = torch.full((40, 3, 32, 32), 100, dtype=torch.uint8)
@@ -44,6 +47,15 @@ def test_a_shift_moves_what_is_seen_along_both_axes_by_pixels_of_64():
     assert 1.5 < float(place.abs().max()) <= 2.05
     assert float(place.mean(0).abs().max()) < 0.5
     assert torch.unique(place.sign(), dim=0).shape[0] == 4
+
+
+def test_both_frames_of_a_state_are_seen_by_one_camera(monkeypatch):
+    monkeypatch.setattr(known, "on_host", lambda agent: agent)
+    sees = SimpleNamespace(latent_dim=2, encode=lambda pixels: pixels.float().unflatten(1, (2, 3)).mean((2, 3, 4)))
+    env = SimpleNamespace(previous_state=lambda state: state, draw=lambda state: PLAIN[: len(state)])
+    before, now = known.encode_states(sees, env, torch.zeros(40, 2), augmentation=only("brightness", 0.15)).unbind(1)
+    assert torch.equal(before, now)
+    assert float(now.max() - now.min()) > 10.0
 
 
 def test_a_share_of_the_episodes_is_changed_in_each_way():

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 AUGMENT, STORE, MOMENTS = "torchrl_sspl/data/augmentation.py", "torchrl_sspl/data/store.py", "torchrl_sspl/modules/moments.py"
+KNOWN, SELECT = "torchrl_sspl/evaluation/known.py", "torchrl_sspl/trainers/selection.py"
 
 CHANGED, PLACED = "tests/data/test_augmentation.py", "tests/modules/test_moments.py"
+SELECTED = "tests/trainers/test_selection.py"
 
 MUTANTS = [
     (AUGMENT, "chosen[:, 0] * self.noise * drawn[:, 0]", "chosen[:, 0] * self.noise", CHANGED),
@@ -17,4 +19,8 @@ MUTANTS = [
     (STORE, "episode = (~linked).cumsum(0) - 1", "episode = torch.arange(len(linked))", CHANGED),
     (MOMENTS, "(like.flatten(1) @ self.places.T + still).argmax(1)", "(like.flatten(1) @ self.places.T).argmax(1)", PLACED),
     (MOMENTS, "        super()._load_from_state_dict(*arguments)\n        self._look()", "        super()._load_from_state_dict(*arguments)", PLACED),
+    (KNOWN, "torch.arange(len(part)).repeat(2)", "torch.arange(2 * len(part))", CHANGED),
+    (SELECT, "_CHANGED_SHARE = 2e-5", "_CHANGED_SHARE = 1e-3", SELECTED),
+    (SELECT, "changed = held_out.changed <= level", "changed = held_out.changed <= level - 0.1", SELECTED),
+    (SELECT, "changed = encode_states(agent, env, in_unsafe, augmentation=cameras)", "changed = encode_states(agent, env, in_unsafe)", SELECTED),
 ]

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.configs import SynthesisConfig
+from torchrl_sspl.data import Augmentation
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.evaluation import Episodes
 from torchrl_sspl.lipschitz import SandwichBarrier
@@ -138,6 +139,39 @@ def test_where_no_level_passes_the_reason_is_that_of_zero_and_nothing_is_kept():
 def test_an_empty_set_is_called_so():
     work = judged(None)
     assert (work.checks[0].passed, work.checks[0].reason, work.checks[0].size) == (False, "the set is empty", 0.0)
+
+
+def test_pictures_are_encoded_once_for_all_levels(monkeypatch):
+    work, phase, drawn = workspace(), CheckRound(0), []
+    draw = type(work.source.env).draw
+    monkeypatch.setattr(type(work.source.env), "draw", lambda self, state: drawn.append(len(state)) or draw(self, state))
+    first = phase._pictures(work, work.agent(0.0))
+    count = len(drawn)
+    assert phase._pictures(work, work.agent(0.05)) is first
+    assert len(drawn) == count > 0
+
+
+def test_where_training_changes_its_pictures_those_of_u_are_held_out_changed_too():
+    plain, changed = workspace(), workspace()
+    changed.source.augmentation = Augmentation(share=1.0, noise=40.0)
+    one, other = (CheckRound(0)._pictures(work, work.agent(0.0)) for work in (plain, changed))
+    assert one.changed is None
+    assert torch.equal(other.unsafe, one.unsafe)
+    assert torch.equal(other.safe, one.safe)
+    assert len(other.changed) == len(one.unsafe)
+    assert (other.changed != one.unsafe).any(1).all()
+    agent = changed.agent(0.5)
+    found = CheckRound(0)._held_out(changed, agent)
+    assert torch.equal(found.changed, agent.least_barrier(other.changed))
+
+
+def test_two_of_100_000_changed_pictures_of_u_may_lie_inside():
+    few, many = (values(n, usual=0.5, one=-0.1) for n in (49_999, 50_000))
+    assert check(held_out(changed=few)).reason == "unsafe inside as changed 1"
+    assert check(held_out(changed=many)).passed
+    assert check(held_out(changed=many), level=-0.05).unsafe_inside == 0
+    assert check(held_out(changed=values(9, usual=0.5, one=0.0))).reason == "unsafe inside as changed 1"  # zero is inside
+    assert judged(held_out(changed=values(8, usual=0.5, one=0.052))).checks[0].level == pytest.approx(0.05, abs=1e-6)
 
 
 def test_the_best_networks_come_back_with_their_level():

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import torch
 from torch import Tensor
 from torch.nn import functional as F
@@ -46,6 +48,12 @@ class Augmentation:
                 f"{share!r}, {noise!r}, {brightness!r} and {shift!r}"
             )
         self.share, self.noise, self.brightness, self.shift, self.seed = share, noise, brightness, shift, seed
+
+    def with_seed(self, seed: int) -> Augmentation:
+        """The same changes, drawn anew."""
+        other = copy.copy(self)
+        other.seed = seed
+        return other
 
     def __call__(self, frames: Tensor, episode: Tensor, position: int = 0) -> Tensor:
         """Changed frames ``(n, 3, H, W)`` uint8, those of one number of ``episode`` ``(n,)`` by one camera; another draw for

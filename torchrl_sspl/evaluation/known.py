@@ -13,6 +13,7 @@ from torch import Tensor
 
 from torchrl_sspl import functional
 from torchrl_sspl.configs.schema import EvaluationConfig
+from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, Camera, Controller, as_controller
 from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, quantiles, share
@@ -24,7 +25,9 @@ from torchrl_sspl.viability.grid import ViabilityKernel, recoverable_set, viabil
 
 
 @torch.no_grad()
-def encode_states(agent: Agent, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None) -> Tensor:
+def encode_states(
+    agent: Agent, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None, augmentation: Augmentation | None = None
+) -> Tensor:
     """Latents ``(n, p)`` of true states ``(n, state_dim)``, seen through two frames. Source: none.
 
     Args:
@@ -32,12 +35,16 @@ def encode_states(agent: Agent, env: SafetyEnv, state: Tensor, *, draw: Draw | N
         env: gives the state one step earlier, and the pictures.
         state: ``(n, state_dim)``.
         draw: states ``(n, state_dim)`` -> frames ``(n, 3, H, W)`` uint8; default ``env.draw``.
+        augmentation: changes these frames, both of a state as seen by one camera.
     """
     agent, draw = on_host(agent), draw or env.draw
-    if not len(state):
-        return torch.zeros(0, agent.latent_dim)
-    parts = state.split(CHUNK)
-    return torch.cat([agent.encode(torch.cat([draw(env.previous_state(x)), draw(x)], dim=-3)) for x in parts])
+    latents = [torch.zeros(0, agent.latent_dim)]
+    for position, part in enumerate(state.split(CHUNK) if len(state) else ()):
+        frames = torch.cat([draw(env.previous_state(part)), draw(part)])
+        if augmentation is not None:
+            frames = augmentation(frames, torch.arange(len(part)).repeat(2), position)
+        latents.append(agent.encode(torch.cat(frames.chunk(2), dim=-3)))
+    return torch.cat(latents)
 
 
 def barrier_of(acts: Any, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None) -> Tensor | None:

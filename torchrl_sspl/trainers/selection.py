@@ -24,8 +24,21 @@ _LOWEST_LEVEL = -0.2
 _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away from what the set tolerates
 _UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
 _STEP, _TRIED = 2, 6  # levels between two for which a proof is tried, and how many of these
+_CHANGED_SHARE = 2e-5  # of the changed pictures of U that may lie inside: noise has no bound
 _BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
 _Count = tuple[str, int, float]  # of what, how many, and how many there may be
+
+
+@dataclass
+class _Pictures:
+    """Latents of fresh observations, and the states that episodes start from."""
+
+    unsafe: Tensor
+    changed: Tensor | None  # the same of U, as the cameras of the training see them
+    safe: Tensor
+    anywhere: Tensor
+    states: Tensor  # of ``anywhere``
+    back: Tensor  # of U
 
 
 @dataclass
@@ -39,13 +52,15 @@ class _HeldOut:
     back: Episodes
     drift: Tensor  # (n,) norm of the mean innovation of an episode
     largest_innovation: float  # of single steps under random actions
+    changed: Tensor | None = None  # of U, where training changes its pictures
 
 
 class CheckRound(Phase):
     """Held-out checks of a round; the level is moved to the largest set that passes them.
 
     The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations
-    of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for. A set is left from its rim,
+    of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for; and where the training changes
+    its pictures, as many more, changed as these are, of which two in 100,000 may lie inside. A set is left from its rim,
     in the first steps, so many short episodes say more than few long ones. Where a proof is asked for, a level passes if the
     weights say that its set tolerates an error (branch and bound), the checks are made with the memory held in the set,
     and the proof applies to enough of the episodes. An observer that believes itself more than what it sees keeps a
@@ -55,9 +70,11 @@ class CheckRound(Phase):
     """
 
     name = "check"
+    _seen: _Pictures | None = None
 
     def run(self, work: Workspace) -> None:
         """Appends to ``work.checks``; keeps the networks if they are the best that has passed."""
+        self._seen = None
         agent = work.agent(0.0)
         held_out = self._held_out(work, agent)
         if held_out is None:
@@ -94,11 +111,15 @@ class CheckRound(Phase):
         return None
 
     @staticmethod
-    def _mixed(work: Workspace, held_out: _HeldOut, level: float) -> tuple[_Count, _Count]:
-        """Observations of U inside the set, and of S outside."""
+    def _mixed(work: Workspace, held_out: _HeldOut, level: float) -> list[_Count]:
+        """Observations of U inside the set, and of S outside; and changed ones of U inside, where training changes them."""
         s = work.config
         inside, outside = held_out.unsafe <= level + s.guard, held_out.safe > level
-        return ("unsafe inside", int(inside.sum()), 0), ("safe outside", int(outside.sum()), s.safe_share * len(outside))
+        counts = [("unsafe inside", int(inside.sum()), 0.0), ("safe outside", int(outside.sum()), s.safe_share * len(outside))]
+        if held_out.changed is not None:
+            changed = held_out.changed <= level
+            counts.append(("unsafe inside as changed", int(changed.sum()), _CHANGED_SHARE * len(changed)))
+        return counts
 
     @staticmethod
     def _covered(run: Episodes, agent: Agent) -> float:
@@ -106,31 +127,39 @@ class CheckRound(Phase):
         assert run.barrier is not None
         return float(covered(run, agent)[run.barrier[0] <= 0].float().mean())
 
+    def _pictures(self, work: Workspace, agent: Agent) -> _Pictures:
+        """Drawn and encoded once in a round: a level moves the barrier alone."""
+        if self._seen is None:
+            source, n = work.source, work.config.check_episodes
+            env, generator = source.env, torch.Generator().manual_seed(spawn(work.seed, "checks", self.number))
+            in_unsafe = env.sample_states(min(8 * n, _UNSAFE_DRAWS), generator, region=env.unsafe_set)
+            unsafe, changed = encode_states(agent, env, in_unsafe), None
+            if source.augmentation is not None:
+                cameras = source.augmentation.with_seed(spawn(work.seed, "checks", 2000 + self.number))
+                changed = encode_states(agent, env, in_unsafe, augmentation=cameras)
+            safe = encode_states(agent, env, env.sample_states(n, generator, region=env.safe_set))
+            states = env.sample_states(3 * n, generator, region=source.outside_unsafe)
+            back = env.sample_states(min(max(1, n // 4), _BACK[0]), generator, region=env.unsafe_set)
+            self._seen = _Pictures(unsafe, changed, safe, encode_states(agent, env, states), states, back)
+        return self._seen
+
     def _held_out(self, work: Workspace, agent: Agent) -> _HeldOut | None:
-        s, source = work.config, work.source
-        env, n = source.env, s.check_episodes
-        generator = torch.Generator().manual_seed(spawn(work.seed, "checks", self.number))
-
-        def values(states: Tensor) -> Tensor:
-            return agent.barrier(encode_states(agent, env, states))[:, 0]
-
-        in_unsafe = env.sample_states(min(8 * n, _UNSAFE_DRAWS), generator, region=env.unsafe_set)
-        unsafe = agent.least_barrier(encode_states(agent, env, in_unsafe))
-        safe = values(env.sample_states(n, generator, region=env.safe_set))
-        states = env.sample_states(3 * n, generator, region=source.outside_unsafe)
-        anywhere = values(states)
-        start = states[anywhere <= _HIGHEST_LEVEL][:n]
+        s, env, n = work.config, work.source.env, work.config.check_episodes
+        seen = self._pictures(work, agent)
+        unsafe = agent.least_barrier(seen.unsafe)
+        changed = None if seen.changed is None else agent.least_barrier(seen.changed)
+        safe, anywhere = (agent.barrier(latent)[:, 0] for latent in (seen.safe, seen.anywhere))
+        start = seen.states[anywhere <= _HIGHEST_LEVEL][:n]
         if not len(start):
             return None
         episodes = simulate(agent, env, start=start, horizon=s.check_horizon)
-        back_from = env.sample_states(min(max(1, n // 4), _BACK[0]), generator, region=env.unsafe_set)
-        back = simulate(agent, env, start=back_from, horizon=max(2 * s.check_horizon, _BACK[1]))
+        back = simulate(agent, env, start=seen.back, horizon=max(2 * s.check_horizon, _BACK[1]))
         drift, largest = episodes.innovation[1:].mean(0).norm(dim=-1), math.inf
         if work.observing:
             chance = AgentController(agent, driver=RandomController.within(env, spawn(work.seed, "checks", 1000 + self.number)))
             at_random = simulate(chance, env, start=start[: max(1, n // 10)], horizon=s.check_horizon)
             largest = float(at_random.innovation.norm(dim=-1).max())
-        return _HeldOut(unsafe, safe, anywhere, episodes, back, drift, largest)
+        return _HeldOut(unsafe, safe, anywhere, episodes, back, drift, largest, changed)
 
     def _check(self, work: Workspace, held_out: _HeldOut, level: float) -> Check:
         s, run, back = work.config, held_out.episodes, held_out.back
@@ -149,7 +178,7 @@ class CheckRound(Phase):
         if bool((drift > held_out.largest_innovation).any()):
             faults.append(f"innovations with a mean of up to {float(drift.max()):.2g}")
         passed = not faults and size > 0
-        bad, out = (found for _, found, _ in mixed)
+        bad, out = (found for _, found, _ in mixed[:2])
         return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults))
 
 

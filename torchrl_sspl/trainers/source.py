@@ -181,9 +181,8 @@ class Source:
         env = self.make_env(batch_size=[min(self.envs, n, envs)], seed=self.seed)
         parts = list[Latents]()
         for k, size in enumerate(c.numel() for c in torch.arange(n).split(_CHUNK)):
-            seed, changes = spawn(self.seed, "rounds", 1000 * index + k), copy.copy(self.augmentation)
-            if changes is not None:
-                changes.seed = seed
+            seed = spawn(self.seed, "rounds", 1000 * index + k)
+            changes = None if self.augmentation is None else self.augmentation.with_seed(seed)
             store = TransitionStore(size, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=changes)
             draw(env, store, seed)
             self.count(store)
