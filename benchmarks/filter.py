@@ -22,7 +22,7 @@ from torchrl_sspl.evaluation.controllers import AgentController, Decision
 from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.evaluation.simulation import Episodes
 from torchrl_sspl.runtime import Protected, SafetyWrapper, Shield
-from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
+from torchrl_sspl.runtime.filter import LEVEL, UNPROVED_MARGIN
 from torchrl_sspl.runtime.monitor import starts
 from torchrl_sspl.sets import UNSAFE
 
@@ -150,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print("|---|---|---|---|---|---|---|")
     policies = {"random": random_actions, "adversarial": ADVERSARIAL[given.agent], "own": None}
     for label, wants in policies.items():
-        for level in (None, *(given.levels or (0.0, -0.1))) if given.only in (None, label) else ():
+        for level in (None, *(given.levels or (0.0, LEVEL))) if given.only in (None, label) else ():
             options = None if level is None else {"level": level, "margin": margin}
             if given.physics:
                 run, told = in_physics(agent, env, start, wants, options)

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-README = Path(__file__).parents[1] / "README.md"
+import torchrl_sspl
+
+README, PACKAGE = Path(__file__).parents[1] / "README.md", Path(torchrl_sspl.__file__).parent
 BLOCKS = re.findall(r"```python\n(.*?)```", README.read_text(), flags=re.DOTALL)
 
 
@@ -22,7 +24,8 @@ def test_readme_has_code():
 
 def test_links_of_the_readme_exist():
     for target in re.findall(r"\]\((?!http)([^)#]+)\)", README.read_text()):
-        assert (README.parent / target).exists(), target
+        root = PACKAGE if target.startswith(PACKAGE.name) else README  # the package may be that of a wheel
+        assert (root.parent / target).exists(), target
 
 
 def test_the_readme_is_short():

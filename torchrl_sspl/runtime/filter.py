@@ -18,7 +18,7 @@ from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.observer import LatentObserver
 
 MODES = ("nearest", "blend")
-LEVEL = -0.1
+LEVEL = -0.12
 UNPROVED_MARGIN = 0.02  # for an agent without a proof
 _GRID, _MOST = 81, 729  # actions per dimension that are tried, and in all
 _LINE, _HALVINGS = 16, 8  # actions on the way to the agent's own one, and halvings of what is left of the way
