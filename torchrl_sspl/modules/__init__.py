@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from torchrl_sspl.modules.choosing import ChoosingPolicy
+from torchrl_sspl.modules.contrast import ContrastEncoder
 from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder, TurnedBearingEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
 from torchrl_sspl.modules.observer import LatentObserver, Predict
@@ -11,6 +12,7 @@ from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout
 __all__ = [
     "BearingEncoder",
     "ChoosingPolicy",
+    "ContrastEncoder",
     "FrameEncoder",
     "InverseDynamics",
     "LatentDynamics",

@@ -23,6 +23,7 @@ from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.files import write
 from torchrl_sspl.lipschitz import prove_lipschitz
 from torchrl_sspl.modules.choosing import ChoosingPolicy
+from torchrl_sspl.modules.contrast import ContrastEncoder
 from torchrl_sspl.modules.controller import Controller
 from torchrl_sspl.modules.export import export
 from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder, TurnedBearingEncoder
@@ -47,8 +48,8 @@ def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
 
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
 ENCODERS: dict[str, type[nn.Module]] = {
-    "FrameEncoder": FrameEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder, "BearingEncoder": BearingEncoder,
-    "TurnedBearingEncoder": TurnedBearingEncoder,
+    "FrameEncoder": FrameEncoder, "ContrastEncoder": ContrastEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder,
+    "BearingEncoder": BearingEncoder, "TurnedBearingEncoder": TurnedBearingEncoder,
 }  # fmt: skip
 DYNAMICS: dict[str, type[nn.Module]] = {"LatentDynamics": LatentDynamics}
 POLICIES: dict[str, type[nn.Module]] = {"ChoosingPolicy": ChoosingPolicy, "Policy": Policy}

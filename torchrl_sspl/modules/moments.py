@@ -13,14 +13,14 @@ from torchrl_sspl.errors import ConfigError, EmptyRegionError
 from torchrl_sspl.modules.networks import FrameEncoder, mlp
 
 _NOISE = 0.05  # difference in [-1, 1] that is not seen
-_FAINT = 0.15  # the same of a bearing: the noise of a bad camera
+FAINT = 0.15  # the same of a bearing: the noise of a bad camera
 _REACH = 1.5  # pixels of 64 by which a camera may be out of place
 _EDGE = 16  # of a frame's width: so many pixels have to speak for it
 _VAGUE = 0.03  # scaled length below which a direction is none
 _WHOLE = 0.9  # of the usual covered share, from which a thing is seen as a whole
 
 
-def _background(frames: Tensor) -> Tensor:
+def background_of(frames: Tensor) -> Tensor:
     """The median ``(c, H, W)`` of frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
     if len(frames) < 10:
         raise EmptyRegionError(f"expected at least 10 frames to fit to, received {len(frames)}; collect more data")
@@ -84,7 +84,7 @@ class ColourMoments(nn.Module):
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
         """Take background and whitening from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
-        self.background.copy_(_background(frames))
+        self.background.copy_(background_of(frames))
         centre = _in_parts(self.centres, frames).double()
         values, vectors = torch.linalg.eigh(torch.cov(centre.T))
         kept = self.whitening.shape[1]
@@ -97,7 +97,19 @@ class ColourMoments(nn.Module):
         return (_in_parts(self.centres, frames) - self.mean) @ self.whitening
 
 
-class MomentEncoder(FrameEncoder):
+class Fitted(FrameEncoder):
+    """Frame encoder whose first layer takes statistics from frames before the training. Source: none."""
+
+    @torch.no_grad()
+    def fit(self, frames: Tensor) -> None:
+        """Take the statistics from frames, uint8 ``(n, 3, H, W)`` of different moments; fewer than ten are an EmptyRegionError."""
+        self._check(frames, self.in_channels, "frames")
+        device = self._weight().device
+        pooled = [F.adaptive_avg_pool2d(part.to(device).float(), self.pool_to) for part in frames.split(500)]
+        self.trunk[0].fit(torch.cat(pooled) / 127.5 - 1.0)  # type: ignore[operator]
+
+
+class MomentEncoder(Fitted):
     r"""Frame encoder on the centres of colours, for a scene in which one thing moves before a background.
 
     .. math:: z_t = \tanh(a \, h_t + \operatorname{MLP}(h_t, k (h_t - h_{t-1}))) \in (-1, 1)^p
@@ -141,14 +153,6 @@ class MomentEncoder(FrameEncoder):
         self.gain = nn.Parameter(torch.tensor(0.6))
         kept = ("latent_dim", "image_size", "velocity_gain", "hidden")
         self.arguments = {**{k: self.arguments[k] for k in kept}, "pool_to": pool_to}
-
-    @torch.no_grad()
-    def fit(self, frames: Tensor) -> None:
-        """Take background and whitening from frames, uint8 ``(n, 3, H, W)`` of different moments."""
-        self._check(frames, self.in_channels, "frames")
-        device = self.gain.device
-        pooled = [F.adaptive_avg_pool2d(part.to(device).float(), self.pool_to) for part in frames.split(500)]
-        self.trunk[0].fit(torch.cat(pooled) / 127.5 - 1.0)  # type: ignore[operator]
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
         """Latent from the centres of two successive frames; see :meth:`FrameEncoder.head`."""
@@ -211,7 +215,7 @@ class ShapeMoments(nn.Module):
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
         """Take background and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
-        self.background.copy_(_background(frames))
+        self.background.copy_(background_of(frames))
         found = _in_parts(self.moments, frames)
         # One scale for both directions: turning the frame turns what is seen.
         pairs = found[:, :4].unflatten(-1, (2, 2)).square().mean((0, 2)).sqrt()
@@ -361,12 +365,12 @@ class Bearing(nn.Module):
         factor = (self.light / light.clamp_min(1e-3)).clamp(0.5, 2.0)[..., None, None]
         off = ((frames + 1.0) * factor - 1.0 - self.background).abs()
         seen = (mixed @ off.flatten(2)).unflatten(2, off.shape[2:])
-        return torch.stack(_centre((seen - _FAINT).clamp_min(0.0) * self.ground, self.axis), 1)
+        return torch.stack(_centre((seen - FAINT).clamp_min(0.0) * self.ground, self.axis), 1)
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
         """Take everything from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
-        self.background.copy_(_background(frames))
+        self.background.copy_(background_of(frames))
         self._look()
         off = (self.background - self.colours[1][:, None, None]).abs().amax(0)
         thing = torch.where(off > _NOISE, off, 0.0)
