@@ -44,7 +44,7 @@ class NetworkConfig:
     dynamics_hidden: list[int] = _option([64, 64], "widths of the latent dynamics' hidden layers.")
     policy_hidden: list[int] = _option([32, 32], "widths of the policy's hidden layers.")
     encoder: str = _option("FrameEncoder", 'name of an encoder of the library ("FrameEncoder": convolutions, '
-        '"MomentEncoder": centres of colours before a background, "ShapeEncoder": place and direction of one thing of one '
+        '"ContrastEncoder": convolutions on what differs from the background, "MomentEncoder": centres of colours before a background, "ShapeEncoder": place and direction of one thing of one '
         'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves, "TurnedBearingEncoder": and how it is turned), or "package.module:Class" of your own, called with '
         'those of latent_dim, image_size, pool_to and velocity_gain that it takes.')
     pool_to: int = _option(32, "frames are averaged to this height and width before the first layer, in pixels.")

@@ -1,77 +1,143 @@
-"""An encoder that learns from what differs from the background, which a camera's noise and brightness do not."""
+"""An encoder that learns from what differs from the background, as a camera in its place and of the usual brightness sees it."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
+from torch.nn import functional as F
 
-from torchrl_sspl.modules.moments import FAINT, Fitted, background_of
+from torchrl_sspl.modules.moments import FAINT, NOISE, REACH, WHOLE, Fitted, background_of, in_parts
+
+_MARKS = 4  # pixels of what stands still by which the camera's place is told
+_PER_PIXEL = 4  # places that are tried, per pixel of 64 and axis
+_SURE = 0.02  # mean squared difference by which another place has to fit better to be believed
 
 
 class Contrast(nn.Module):
-    r"""What differs from the background, of frames as bright as it is.
+    r"""What differs from the background, of frames as bright as it is, from a camera in its place.
 
-    .. math:: x_k = \kappa_k f_k - b_k, \qquad h_k = \operatorname{sign}(x_k) \max(0, |x_k| - \epsilon)
+    .. math:: x_k = \kappa_k f_k(\cdot + s) - b_k, \qquad h_k = \operatorname{sign}(x_k) \max(0, |x_k| - \epsilon)
 
     The background b is the median of frames from different moments; :math:`\kappa_k` makes a frame as bright as the frames are in the
-    median, black counting zero, and what is smaller than :math:`\epsilon` is a camera's noise. All of it comes from frames alone and is
-    set by :meth:`fit`. Source: none.
+    median, black counting zero. Where something stands still before plain ground, such as the axle of a pendulum or an obstacle, the
+    shift s, at most one and a half pixels of 64, puts its most distinct pixels to where they were. What is smaller than :math:`\epsilon`
+    is a camera's noise. All of it comes from frames alone and is set by :meth:`fit`. Source: none.
 
     Args:
-        size: height and width of the (pooled) frames.
+        size: height and width of the (pooled) frames that are seen, even; what is given has half of it.
         channels: colours.
 
     Example:
-        >>> frames = torch.ones(50, 3, 16, 16)
-        >>> places = torch.randint(16, (50, 2), generator=torch.Generator().manual_seed(0))
-        >>> frames[torch.arange(50), :, places[:, 0], places[:, 1]] = 0.0  # one dark pixel each
-        >>> contrast = Contrast(16)
+        >>> frames = torch.ones(50, 3, 64, 64)
+        >>> frames[:, :, 32, 32] = -1.0  # it stands still
+        >>> places = torch.randint(2, 28, (50, 2), generator=torch.Generator().manual_seed(0))
+        >>> frames[torch.arange(50), :, places[:, 0], places[:, 1]] = 0.0  # one dark pixel each moves
+        >>> contrast = Contrast(64)
         >>> contrast.fit(frames)
         >>> darker = contrast((frames + 1.0) * 0.9 - 1.0)
-        >>> int((darker != 0.0).sum()), bool(torch.allclose(darker, contrast(frames), atol=1e-6))
-        (150, True)
+        >>> bool(torch.allclose(darker, contrast(frames), atol=1e-6)), bool((darker[:, :, 16, 16] == 0.0).all())
+        (True, True)
+        >>> bool(torch.allclose(contrast(frames.roll(1, -1)), contrast(frames), atol=1e-4))
+        True
     """
 
     background: Tensor
     light: Tensor
+    shifts: Tensor
+    marks: Tensor
+    around: Tensor
+    weights: Tensor
 
     def __init__(self, size: int, channels: int = 3) -> None:
         super().__init__()
         self.register_buffer("background", torch.ones(channels, size, size))
         self.register_buffer("light", torch.full((channels,), 2.0))  # mean over the frame, black counts zero
+        reach, steps = REACH * size / 64, int(REACH * _PER_PIXEL)
+        along = torch.arange(-steps, steps + 1) * reach / steps
+        self.register_buffer("shifts", torch.cartesian_prod(along, along), persistent=False)  # (s, 2) pixels, down and to the right
+        n = len(self.shifts)
+        self.register_buffer("marks", torch.zeros(channels, 0), persistent=False)  # colours of the pixels by which places are told
+        self.register_buffer("around", torch.zeros(0, dtype=torch.long), persistent=False)  # pixels around them, at any place
+        self.register_buffer("weights", torch.zeros(0, n, 0), persistent=False)  # of these, for every place and mark
+        self._look()
+
+    def _look(self) -> None:
+        """Takes from the background by which pixels :meth:`in_place` tells where the camera is."""
+        beside = self.background.flatten(1).median(1).values
+        off = (self.background - beside[:, None, None]).abs().amax(0).flatten()
+        rank = off.argsort(descending=True, stable=True)[:_MARKS]
+        index = rank[off[rank] > max(NOISE, WHOLE * float(off.amax()))]
+        size = self.background.shape[-1]
+        at = torch.stack([index // size, index % size], -1) + self.shifts[:, None]  # (s, k, 2)
+        pixels = torch.cartesian_prod(torch.arange(size), torch.arange(size)).to(at.device)
+        near = (1.0 - (pixels[:, None, None] - at.clamp(0, size - 1)).abs()).clamp_min(0.0).prod(-1)  # bilinear: (H W, s, k)
+        self.around = (near > 0).any(-1).any(-1).nonzero()[:, 0]
+        self.marks, self.weights = self.background.flatten(1)[:, index], near[self.around]
+
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        super()._load_from_state_dict(*arguments)
+        self._look()
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
         """Take background and brightness from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(background_of(frames))
         self.light.copy_((frames + 1.0).mean((-2, -1)).median(0).values)
+        self._look()
+
+    def in_place(self, frames: Tensor) -> Tensor:
+        """Frames ``(n, c, H, W)`` as a camera that is in its place sees them."""
+        if not self.marks.shape[1]:
+            return frames  # nothing stands still
+        seen = (frames.flatten(2)[:, :, self.around] @ self.weights.flatten(1)).unflatten(2, self.weights.shape[1:])
+        apart = (seen - self.marks[:, None]).square().mean((1, 3))  # (n, s)
+        still = len(self.shifts) // 2
+        best = (apart + _SURE * (torch.arange(len(self.shifts), device=apart.device) != still)).argmin(1)
+        if not (torch.compiler.is_compiling() or torch.compiler.is_exporting()) and bool((best == still).all()):
+            return frames  # most often; nothing to sample anew
+        by = self.shifts[best].flip(-1) * (2.0 / frames.shape[-1])  # to the right, down
+        to = torch.cat([torch.eye(2, device=by.device).expand(len(by), 2, 2), by[..., None]], 2)
+        grid = F.affine_grid(to, list(frames.shape), align_corners=False)
+        return F.grid_sample(frames, grid, padding_mode="border", align_corners=False)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Differences ``(n, c, H, W)`` of frames ``(n, c, H, W)`` in [-1, 1]."""
+        """Differences ``(n, c, H / 2, W / 2)`` of frames ``(n, c, H, W)`` in [-1, 1]."""
+        return in_parts(self._differences, frames)
+
+    def _differences(self, frames: Tensor) -> Tensor:
         light = (frames + 1.0).mean((-2, -1))
         factor = (self.light / light.clamp_min(1e-3)).clamp(0.5, 2.0)[..., None, None]
-        off = (frames + 1.0) * factor - 1.0 - self.background
+        off = F.avg_pool2d(self.in_place((frames + 1.0) * factor - 1.0) - self.background, 2)
         return off - off.clamp(-FAINT, FAINT)
 
 
 class ContrastEncoder(Fitted):
-    r"""Frame encoder on what differs from the background, for a camera that stands still.
+    r"""Frame encoder on what differs from the background, for a camera that should stand still.
 
     .. math:: z_t = \operatorname{FrameEncoder}(h_t, h_{t-1}) \in (-1, 1)^p
 
     with the contrasts h of :class:`Contrast` in place of the frames: convolutions learn as in
-    :class:`~torchrl_sspl.modules.FrameEncoder`, whose arguments and errors it has, from pictures in which a camera's noise (up to about
-    12 grey levels of 255 before pooling by two) and another brightness are hardly seen. Before the training :meth:`fit` takes the
-    background from frames; no label and no state enters. Source: paper eq. (7); the paper does not give an architecture.
+    :class:`~torchrl_sspl.modules.FrameEncoder`, whose arguments and errors it has, from pictures in which a camera's noise, another
+    brightness and a small shift are hardly seen. Before the training :meth:`fit` takes the background from frames; no label and no
+    state enters. Source: paper eq. (7); the paper does not give an architecture.
+
+    Args:
+        latent_dim: size p of the latent.
+        image_size: height and width of the frames in pixels; ``None`` accepts any size.
+        pool_to: height and width after average pooling, before the camera's place is told; even. Convolutions see half of it.
+        velocity_gain: gain k of the difference of the two frames' features.
 
     Example:
         >>> ContrastEncoder(latent_dim=3, image_size=64)(torch.zeros(2, 6, 64, 64, dtype=torch.uint8)).shape
         torch.Size([2, 3])
     """
 
-    def __init__(self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 32, velocity_gain: float = 4.0) -> None:
-        super().__init__(latent_dim, image_size, pool_to=pool_to, velocity_gain=velocity_gain)
+    def __init__(self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, velocity_gain: float = 4.0) -> None:
+        super().__init__(latent_dim, image_size, pool_to=pool_to // 2, velocity_gain=velocity_gain)
         self.trunk = nn.Sequential(Contrast(pool_to, self.in_channels), *self.trunk)
+        self.pool_to = (pool_to, pool_to)
         self.arguments = {
             "latent_dim": latent_dim, "image_size": self.arguments["image_size"], "pool_to": pool_to, "velocity_gain": velocity_gain,
         }  # fmt: skip

@@ -12,12 +12,12 @@ from torch.nn import functional as F
 from torchrl_sspl.errors import ConfigError, EmptyRegionError
 from torchrl_sspl.modules.networks import FrameEncoder, mlp
 
-_NOISE = 0.05  # difference in [-1, 1] that is not seen
+NOISE = 0.05  # difference in [-1, 1] that is not seen
 FAINT = 0.15  # the same of a bearing: the noise of a bad camera
-_REACH = 1.5  # pixels of 64 by which a camera may be out of place
+REACH = 1.5  # pixels of 64 by which a camera may be out of place
 _EDGE = 16  # of a frame's width: so many pixels have to speak for it
 _VAGUE = 0.03  # scaled length below which a direction is none
-_WHOLE = 0.9  # of the usual covered share, from which a thing is seen as a whole
+WHOLE = 0.9  # of the usual covered share, from which a thing is seen as a whole
 
 
 def background_of(frames: Tensor) -> Tensor:
@@ -34,7 +34,7 @@ def _centre(weight: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
     return (weight.sum(-2) @ axis) / mass, (weight.sum(-1) @ axis) / mass
 
 
-def _in_parts(function: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
+def in_parts(function: Callable[[Tensor], Tensor], frames: Tensor) -> Tensor:
     """A function of frames, of a few at a time, which stay in the cache; an exported graph has no loop."""
     return torch.cat([function(part) for part in ([frames] if torch.compiler.is_exporting() else frames.split(32))])
 
@@ -85,7 +85,7 @@ class ColourMoments(nn.Module):
     def fit(self, frames: Tensor) -> None:
         """Take background and whitening from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(background_of(frames))
-        centre = _in_parts(self.centres, frames).double()
+        centre = in_parts(self.centres, frames).double()
         values, vectors = torch.linalg.eigh(torch.cov(centre.T))
         kept = self.whitening.shape[1]
         scale = values[-kept:].clamp_min(1e-8).rsqrt()
@@ -94,7 +94,7 @@ class ColourMoments(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Whitened centres ``(n, kept)`` of frames ``(n, c, H, W)``."""
-        return (_in_parts(self.centres, frames) - self.mean) @ self.whitening
+        return (in_parts(self.centres, frames) - self.mean) @ self.whitening
 
 
 class Fitted(FrameEncoder):
@@ -199,7 +199,7 @@ class ShapeMoments(nn.Module):
     def moments(self, frames: Tensor) -> Tensor:
         """Moments ``(n, 5)``, not scaled, of frames ``(n, c, H, W)`` in [-1, 1]; x to the right, y down."""
         # What a camera's noise changes is not a thing.
-        weight = ((frames - self.background).abs().amax(1) - _NOISE).clamp_min(0.0)
+        weight = ((frames - self.background).abs().amax(1) - NOISE).clamp_min(0.0)
         columns, rows = weight.sum(-2), weight.sum(-1)
         mass = rows.sum(-1, keepdim=True).clamp_min(1e-3 * self.axis.numel())  # less than that is nothing: the middle
         x, y = columns @ self.axis[:, None] / mass, rows @ self.axis[:, None] / mass
@@ -216,14 +216,14 @@ class ShapeMoments(nn.Module):
     def fit(self, frames: Tensor) -> None:
         """Take background and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(background_of(frames))
-        found = _in_parts(self.moments, frames)
+        found = in_parts(self.moments, frames)
         # One scale for both directions: turning the frame turns what is seen.
         pairs = found[:, :4].unflatten(-1, (2, 2)).square().mean((0, 2)).sqrt()
         self.scale.copy_(torch.cat([pairs.repeat_interleave(2), found[:, 4:].median(0).values]).clamp_min(1e-8))
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scaled moments ``(n, 5)`` of frames ``(n, c, H, W)``."""
-        return _in_parts(self.moments, frames) / self.scale
+        return in_parts(self.moments, frames) / self.scale
 
 
 class ShapeEncoder(MomentEncoder):
@@ -267,7 +267,7 @@ class ShapeEncoder(MomentEncoder):
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
         """Latent from the moments of two successive frames; see :meth:`FrameEncoder.head`."""
-        whole = (torch.minimum(previous, current)[..., 4:] / _WHOLE).clamp(0.0, 1.0) ** 4
+        whole = (torch.minimum(previous, current)[..., 4:] / WHOLE).clamp(0.0, 1.0) ** 4
         shape, motion = (previous + current)[..., 2:4] / 2, (current - previous)[..., :2]
         ahead = whole * shape + (1 - whole) * self.velocity_gain * motion
         ahead = ahead / (ahead.square().sum(-1, keepdim=True) + _VAGUE**2).sqrt()
@@ -324,7 +324,7 @@ class Bearing(nn.Module):
         self.register_buffer("contrast", torch.zeros(channels))
         self.register_buffer("anchor", torch.zeros(2))
         self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
-        reach = torch.arange(-int(_REACH * size / 64), int(_REACH * size / 64) + 1)
+        reach = torch.arange(-int(REACH * size / 64), int(REACH * size / 64) + 1)
         self.register_buffer("shifts", torch.cartesian_prod(reach, reach), persistent=False)  # down, to the right
         self.register_buffer("colours", torch.ones(2, channels), persistent=False)  # of the still thing, and beside it
         self.register_buffer("places", torch.zeros(len(self.shifts), size * size), persistent=False)  # 1 on it
@@ -334,8 +334,8 @@ class Bearing(nn.Module):
         """Takes from the background what :meth:`in_place` compares frames with."""
         beside = self.background.flatten(1).median(1).values
         off = (self.background - beside[:, None, None]).abs().amax(0)
-        shape = off / off.max().clamp_min(_NOISE)
-        core = (shape > _WHOLE).float()
+        shape = off / off.max().clamp_min(NOISE)
+        core = (shape > WHOLE).float()
         self.colours.copy_(torch.stack([(self.background * core).sum((1, 2)) / core.sum().clamp_min(1.0), beside]))
         moved = [shape.roll((down, right), (0, 1)) for down, right in self.shifts.tolist()]
         self.places.copy_(torch.stack(moved).flatten(1))
@@ -347,7 +347,7 @@ class Bearing(nn.Module):
     def in_place(self, frames: Tensor) -> Tensor:
         """Frames ``(n, c, H, W)`` as a camera that is in its place sees them."""
         thing, beside = self.colours
-        apart = (frames - thing[:, None, None]).square().sum(1).sqrt() / (thing - beside).norm().clamp_min(_NOISE)
+        apart = (frames - thing[:, None, None]).square().sum(1).sqrt() / (thing - beside).norm().clamp_min(NOISE)
         like = (1.0 - 2.0 * apart).clamp_min(0.0)
         still = (self.shifts == 0).all(1) * self.axis.numel() / _EDGE  # only what is seen clearly moves a frame
         down, right = self.shifts[(like.flatten(1) @ self.places.T + still).argmax(1)].unbind(1)
@@ -373,12 +373,12 @@ class Bearing(nn.Module):
         self.background.copy_(background_of(frames))
         self._look()
         off = (self.background - self.colours[1][:, None, None]).abs().amax(0)
-        thing = torch.where(off > _NOISE, off, 0.0)
+        thing = torch.where(off > NOISE, off, 0.0)
         self.anchor.copy_(torch.stack(_centre(thing, self.axis)))
         self.ground.copy_(1.0 - F.max_pool2d((thing > 0.0).float()[None], 3, 1, 1)[0])
         self.light.copy_(((self.background + 1.0) * self.ground).sum((-2, -1)))
         colours = torch.eye(len(self.contrast), device=frames.device)
-        centres = _in_parts(lambda part: self.centres(part, colours), frames).double()
+        centres = in_parts(lambda part: self.centres(part, colours), frames).double()
         apart = centres - centres.mean(-1, keepdim=True)
         _, vectors = torch.linalg.eigh(torch.einsum("nik,nil->kl", apart, apart))
         contrast = vectors[:, -1] - vectors[:, -1].mean()
@@ -386,7 +386,7 @@ class Bearing(nn.Module):
 
     def forward(self, frames: Tensor) -> Tensor:
         """Place of the still thing, ahead and aside of the moving one, and e of length one: ``(n, 4)`` of frames ``(n, c, H, W)``."""
-        centres = _in_parts(lambda part: self.centres(self.in_place(part)), frames)
+        centres = in_parts(lambda part: self.centres(self.in_place(part)), frames)
         ahead = centres[..., 0] - centres[..., 1]
         ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         away = self.anchor - centres.mean(-1)

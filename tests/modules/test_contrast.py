@@ -1,0 +1,66 @@
+"""The encoder on what differs from the background: noise and brightness of a camera do not reach its convolutions."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import EmptyRegionError
+from torchrl_sspl.modules import ContrastEncoder
+from torchrl_sspl.modules import contrast as module
+from torchrl_sspl.modules.agent import build_encoder
+from torchrl_sspl.runtime import CameraFault
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A fitted encoder, and observations of 200 fresh states."""
+    env = PendulumEnv(image_size=64)
+    generator = torch.Generator().manual_seed(0)
+    torch.manual_seed(0)
+    encoder = ContrastEncoder(3, 64).eval()
+    encoder.fit(env.draw(env.sample_states(500, generator)))
+    return encoder, env.observe(env.sample_states(200, generator))
+
+
+def contrasts(encoder, pixels):
+    """What its convolutions see of the second frames."""
+    with torch.no_grad():
+        return encoder.trunk[0](encoder._pool(pixels[:, 3:].float()) / 127.5 - 1.0)
+
+
+def changed(encoder, pixels, fault, strength):
+    """By how much a fault of the camera changes that, relative to all of it, in nine of ten frames at most."""
+    clean = contrasts(encoder, pixels)
+    off = contrasts(encoder, CameraFault(fault, strength, onset=0, seed=0)(pixels, 0)) - clean
+    return float((off.flatten(1).norm(dim=1) / clean.flatten(1).norm(dim=1)).quantile(0.9))
+
+
+@pytest.mark.parametrize(("fault", "strength", "most"), [("noise", 12.0, 0.1), ("dark", 0.85, 0.01)])
+def test_noise_and_darkness_are_hardly_seen(scene, fault, strength, most):
+    assert changed(*scene, fault, strength) < most
+
+
+def test_without_its_threshold_noise_is(scene, monkeypatch):
+    monkeypatch.setattr(module, "FAINT", 0.0)
+    assert changed(*scene, "noise", 12.0) > 0.2
+
+
+def test_the_background_is_not_seen(scene):
+    encoder, pixels = scene
+    seen = contrasts(encoder, pixels)
+    assert (seen != 0).any(1).float().mean() < 0.06  # the rod covers a hundredth of the frame
+    assert (seen != 0).any(1).flatten(1).any(1).all()
+
+
+def test_it_is_built_again_from_its_arguments(scene):
+    encoder, pixels = scene
+    twin = build_encoder("ContrastEncoder", **encoder.arguments).eval()
+    twin.load_state_dict(encoder.state_dict())
+    assert torch.equal(twin(pixels), encoder(pixels))
+
+
+def test_too_few_frames_are_named():
+    with pytest.raises(EmptyRegionError, match="10 frames"):
+        ContrastEncoder(3, 64).fit(torch.zeros(5, 3, 64, 64, dtype=torch.uint8))
