@@ -46,5 +46,5 @@ def test_walks_have_rows_for_the_faults_of_camera_and_world(benchmark, monkeypat
         "| none", *["| frozen"] * 3, "| pushed, from S", "| slippery, from S", "| pushed, from {B <= 0}", "| slippery, from {B <= 0}",
     ]  # fmt: skip
     assert all(len(row) == 9 for row in rows)
-    assert "with an alarm: 0 of 1, at most 97 %" in printed
+    assert "with an alarm: 0 of 1, at most 95 %" in printed
     assert all(row[5] == "1 of 1" for row in rows[1:4])
