@@ -33,7 +33,7 @@ MUTANTS = [
     (CONTROLLER, "met = (seen <= level) & ", "met = ", OBSERVED),
     (CONTROLLER, "torch.tensor(tolerated > 0.0, device=seen.device)", "torch.tensor(True, device=seen.device)", OBSERVED),
     (CONTROLLER, "else (error <= tolerated))", "else met)", OBSERVED),
-    (CONTROLLER, "self._applies = self._applies & meets_premise", "self._applies = meets_premise", OBSERVED),
+    (CONTROLLER, "self._applies = self._applies & met", "self._applies = met", OBSERVED),
     (CONTROLLER, "memory.expect(agent.dynamics(latent, action), rows)", "memory.expect(latent, rows)", OBSERVED),
     (BLOCKS, "premise_met(barrier[1:], seen[1:], error", "premise_met(seen[1:], seen[1:], error", RUN_TIME),
     (BLOCKS, "premise_met(barrier[1:], seen[1:], error", "premise_met(barrier[1:], barrier[1:], error", RUN_TIME),
