@@ -35,6 +35,12 @@ def milliseconds(call: Callable[[Any], Any], rows: list[Any]) -> str:
     return f"{np.quantile(taken, 0.5):.2f} / {np.quantile(taken, 0.99):.2f}"
 
 
+def protected(monitor: sspl.Monitor, shield: Shield, row: dict[str, torch.Tensor]) -> Any:
+    """Another policy's action behind monitor and filter."""
+    told = monitor.step(row["pixels"])
+    return shield(told.latent, row["action"], told.action)
+
+
 @torch.no_grad()
 def main(*names: str) -> None:
     """Print the table."""
@@ -61,7 +67,7 @@ def main(*names: str) -> None:
             "onnxruntime": partial(session.run, None),
             "torch": lambda row, step=step: step(**row),
             "monitor": lambda row, monitor=monitor: monitor.step(row["pixels"]),
-            "filter": lambda row, monitor=monitor, shield=shield: shield(monitor.step(row["pixels"]).latent, row["action"]),
+            "filter": partial(protected, monitor, shield),
         }
         times = [milliseconds(call, arrays if label == "onnxruntime" else rows) for label, call in calls.items()]
         print(f"| {name} | {' | '.join(times)} | {action:.1e} | {barrier:.1e} |")

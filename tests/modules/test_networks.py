@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -180,6 +182,14 @@ def test_saturated_policy_comes_back_where_a_clamp_stays_stuck() -> None:
 
     assert train(inward_clamp) == pytest.approx(-0.5, abs=1e-3)
     assert train(lambda v: v.clamp(-1, 1)) == 1.0
+
+
+def test_inward_clamp_is_the_same_clamp_without_a_gradient() -> None:
+    value = torch.tensor([-2.0, 0.5, 2.0, math.nan, -0.0], requires_grad=True)
+    with torch.no_grad():
+        quick = inward_clamp(value)
+    assert torch.equal(quick.view(torch.int32), inward_clamp(value).detach().view(torch.int32))
+    assert not quick.requires_grad
 
 
 def test_inward_clamp_works_under_vmap_of_grad() -> None:

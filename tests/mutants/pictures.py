@@ -17,7 +17,7 @@ MUTANTS = [
     (AUGMENT, "spawn(self.seed, \"pictures\", position)", "spawn(self.seed, \"pictures\", 0)", CHANGED),
     (AUGMENT, "seen.round_().clamp_(0, 255)", "seen.round_()", CHANGED),
     (STORE, "episode = (~linked).cumsum(0) - 1", "episode = torch.arange(len(linked))", CHANGED),
-    (MOMENTS, "(like.flatten(1) @ self.places.T + still).argmax(1)", "(like.flatten(1) @ self.places.T).argmax(1)", PLACED),
+    (MOMENTS, "(like.flatten(1) @ self.places.T + self.still).argmax(1)", "(like.flatten(1) @ self.places.T).argmax(1)", PLACED),
     (MOMENTS, "        super()._load_from_state_dict(*arguments)\n        self._look()", "        super()._load_from_state_dict(*arguments)", PLACED),
     (KNOWN, "torch.arange(len(part)).repeat(2)", "torch.arange(2 * len(part))", CHANGED),
     (SELECT, "_CHANGED_SHARE = 2e-5", "_CHANGED_SHARE = 1e-3", SELECTED),

@@ -93,6 +93,36 @@ def test_bad_actions_are_refused_and_nothing_moves(env, action, error):
     np.testing.assert_array_equal(env._robot.pose, info["pose"])
 
 
+def test_a_push_moves_the_robot_to_its_left_once(env):
+    moved = []
+    for impulse in (0.0, 12.0, -12.0):
+        env.reset(options={"pose": [-1.5, -1.7, 0.0], "phase": 0.0})
+        env.push(impulse)
+        found = [env.step(np.array([0.0]))[4]["pose"] for _ in range(4)]
+        moved.append((found[0][1], float(env._robot.measured.velocity[1])))
+    (still, calm), (left, after), (right, _) = moved
+    assert left - still > 0.03
+    assert still - right > 0.03
+    assert abs(after - calm) < 0.3  # the push is over, and what it gave is gone
+    env.push(12.0)
+    env.reset(options={"pose": [-1.5, -1.7, 0.0], "phase": 0.0})  # forgotten
+    assert env.step(np.array([0.0]))[4]["pose"][1] == still
+    with pytest.raises(NonFiniteError, match="impulse"):
+        env.push(math.inf)
+
+
+def test_ground_that_is_too_slippery_makes_it_fall(env):
+    ice = DubinsEnv(batch_size=[1]).physics()(friction=0.05)
+    fell = []
+    for world_ in (env, ice):
+        world_.reset(options={"pose": [-1.5, -1.7, 0.0], "phase": 0.0})
+        fell.append(any(world_.step(np.array([1.5]))[4]["fallen"] for _ in range(8)))
+    ice.close()
+    assert fell == [False, True]
+    with pytest.raises(ConfigError, match="friction"):
+        QuadrupedEnv(friction=0.0)
+
+
 def test_gymnasium_finds_it_and_several_live_in_one_process(env):
     made = gymnasium.make("SSPL/QuadrupedObstacle-v0", obstacle_shape="disc", render_mode="rgb_array")
     pixels, info = made.reset(seed=3)

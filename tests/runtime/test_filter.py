@@ -123,6 +123,15 @@ def test_no_more_is_asked_of_an_action_than_of_the_agents_own(own, wanted, taken
     assert bool(found.intervened) == (wanted != taken)
 
 
+def test_the_agents_own_action_is_the_one_that_is_known_already():
+    latent, wanted = torch.tensor([[0.45], [0.55]]), torch.tensor([[1.0], [1.0]])
+    found, known = shield()(latent, wanted), shield()(latent, wanted, torch.tensor([[-1.0], [-1.0]]))
+    assert all(torch.equal(getattr(found, name), getattr(known, name)) for name in vars(found))
+    assert shield()(latent, wanted, torch.tensor([[-1.0], [-0.7]])).action[1] == -0.7  # outside it is what is taken
+    with pytest.raises(ShapeError, match=r"\(2, 1\)"):
+        shield()(latent, wanted, torch.zeros(2, 2))
+
+
 def test_where_no_action_keeps_the_margin_it_is_the_agents_own():
     protect = Shield(line(own=Pushes(0.4)), level=0.0, margin=0.2)  # -1 leads to B = -.15
     assert float(protect(torch.tensor([[0.45]]), torch.tensor([[1.0]])).action) == pytest.approx(0.4)

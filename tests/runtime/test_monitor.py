@@ -128,6 +128,18 @@ def test_other_drivers_are_watched_with_their_own_actions():
     assert float(watching.extremes()["innovation"][1].max()) < calibration.limits["innovation"][1]
 
 
+def test_episodes_of_unequal_length_one_after_the_other_are_told_apart():
+    agent = load("pendulum")
+    watching = Watching(agent, Calibration.load("pendulum", agent), change=CameraFault("dark", 0.0, onset=2))
+    pictures = shown(1, 4)
+    for length in (2, 4):
+        watching.reset()
+        for picture in pictures[:length]:
+            watching.step(picture)
+    assert watching.alarms().tolist() == [[False, False], [False, False], [False, True], [False, True]]
+    assert watching.applies().tolist() == [[True, True], [True, True], [False, False], [False, False]]
+
+
 def test_a_fallback_acts_on_the_rows_with_an_alarm_and_the_memory_knows_it():
     monitor = Monitor.load("pendulum", batch_size=2, fallback=lambda told: torch.full_like(told.action, 3.0))
     pictures = shown(2)[0]
@@ -159,6 +171,28 @@ def test_what_is_no_picture_is_an_alarm_and_the_memory_goes_on(pixels, reason):
     assert torch.equal(monitor._controller._memory.prior, expected)
     assert bool(monitor.step(second).action.isfinite().all())
     assert Monitor.load("pendulum").step(pixels).reasons == [[reason]]  # as the first thing that is seen
+
+
+def test_frames_that_follow_each_other_differ_by_nothing_row_by_row():
+    monitor = Monitor.load("pendulum", batch_size=2)
+    first, second = shown(2, 2)
+    monitor.step(first)
+    assert monitor.step(second).signals["order"].tolist() == [0.0, 0.0]
+    second[1, 0, 0, 0] ^= 64
+    monitor.reset()
+    monitor.step(first)
+    assert monitor.step(second).signals["order"].tolist() == pytest.approx([0.0, 64 / (255 * 3 * 64 * 64)])
+
+
+def test_the_premise_is_told_during_an_alarm_too():
+    monitor = Monitor.load("pendulum", signals=("texture",))
+    first, second = shown(1, 2)
+    monitor.calibration.limits["texture"] = (-1.0, 0.0)
+    assert bool(monitor.step(first).alarm)
+    out = monitor.step(second)
+    assert names(out.verdict) == ["UNKNOWN_PICTURE"]
+    assert bool(out.applies)
+    assert not bool(monitor.step(torch.zeros_like(second)).applies)
 
 
 def test_times_that_do_not_fit_are_alarms():

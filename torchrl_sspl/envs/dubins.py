@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -261,7 +262,7 @@ class DubinsEnv(SafetyEnv):
         return DubinsEnv(self.batch_size, horizon=self.horizon, device=self.device, seed=0, **self._geometry())
 
     def physics(self) -> Callable[[], gymnasium.Env] | None:
-        """Maker of the walking robot (paper, Section IV-B) with the same obstacle, regions, speed and actions.
+        """Maker of the walking robot (paper, Section IV-B) with the same obstacle, regions, speed and actions; takes its other options.
 
         Raises MissingDependencyError without the simulator.
         """
@@ -272,7 +273,7 @@ class DubinsEnv(SafetyEnv):
             raise MissingDependencyError(
                 f"full physics: expected the simulator, received {error}; pip install 'torchrl-sspl[quadruped]'."
             ) from error
-        return lambda: QuadrupedEnv(**self._geometry())
+        return partial(QuadrupedEnv, **self._geometry())
 
     def _geometry(self) -> dict[str, Any]:
         """What this car, its twin and the robot in full physics have in common, as keyword arguments of theirs."""

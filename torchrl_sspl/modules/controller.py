@@ -31,6 +31,7 @@ class Memory:
 
     def __init__(self, agent: Any) -> None:
         self.agent = agent
+        self.held_error = agent.held_error  # read once: it looks at K
         self.prior: Tensor | None = None
         self.begins: Tensor | None = None  # (n,) bool
 
@@ -50,7 +51,7 @@ class Memory:
         seen = completed(seen, expected, agent.gain)
         turns = direction_of(agent.dynamics)
         latent, innovation = corrected(expected, seen, agent.gain, turns)
-        latent, cut = held(agent.barrier, expected, latent, agent.held_error, turns)
+        latent, cut = held(agent.barrier, expected, latent, self.held_error, turns)
         return latent, innovation, cut, seen
 
     def unseen(self, n: int) -> Tensor:
@@ -186,7 +187,8 @@ class Controller:
             rows = None
         action, barrier = agent.policy(latent), agent.barrier(latent)[:, 0]
         error = (latent - (seen - innovation)).norm(dim=-1)
-        self._applies = self._applies & meets_premise(agent, barrier, agent.barrier(seen)[:, 0], error)
+        met = premise_met(barrier, agent.barrier(seen)[:, 0], error, agent.tolerated_error, held=memory.held_error > 0.0)
+        self._applies = self._applies & met
         memory.expect(agent.dynamics(latent, action), rows)
         self._last = latent, action.shape
         return Step(action, barrier, barrier <= 0.0, innovation.norm(dim=-1), error, self._applies.clone(), latent, seen)

@@ -313,6 +313,7 @@ class Bearing(nn.Module):
     anchor: Tensor
     axis: Tensor
     shifts: Tensor
+    still: Tensor
     colours: Tensor
     places: Tensor
 
@@ -326,6 +327,8 @@ class Bearing(nn.Module):
         self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
         reach = torch.arange(-int(REACH * size / 64), int(REACH * size / 64) + 1)
         self.register_buffer("shifts", torch.cartesian_prod(reach, reach), persistent=False)  # down, to the right
+        still = (self.shifts == 0).all(1) * size / _EDGE  # only what is seen clearly moves a frame
+        self.register_buffer("still", still, persistent=False)
         self.register_buffer("colours", torch.ones(2, channels), persistent=False)  # of the still thing, and beside it
         self.register_buffer("places", torch.zeros(len(self.shifts), size * size), persistent=False)  # 1 on it
         self._look()
@@ -349,8 +352,9 @@ class Bearing(nn.Module):
         thing, beside = self.colours
         apart = (frames - thing[:, None, None]).square().sum(1).sqrt() / (thing - beside).norm().clamp_min(NOISE)
         like = (1.0 - 2.0 * apart).clamp_min(0.0)
-        still = (self.shifts == 0).all(1) * self.axis.numel() / _EDGE  # only what is seen clearly moves a frame
-        down, right = self.shifts[(like.flatten(1) @ self.places.T + still).argmax(1)].unbind(1)
+        down, right = self.shifts[(like.flatten(1) @ self.places.T + self.still).argmax(1)].unbind(1)
+        if not torch.compiler.is_compiling() and not bool((down | right).any()):
+            return frames
         size = len(self.axis)
         pixels = torch.arange(size, device=frames.device)
         rows, columns = ((pixels + by[:, None]).clamp(0, size - 1) for by in (down, right))

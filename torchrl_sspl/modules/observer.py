@@ -106,6 +106,8 @@ def held(
     moved = latent - prior
     length = moved.norm(dim=-1, keepdim=True)
     leaves = (barrier(prior) <= 0.0) & (barrier(latent) > 0.0) & (length > error)
+    if not torch.compiler.is_compiling() and not bool(leaves.any()):
+        return latent, leaves[..., 0]
     most = error if direction is None else direction.shortened(error)
     return torch.where(leaves, within(prior + moved * (most / length), direction), latent), leaves[..., 0]
 

@@ -85,19 +85,21 @@ class Shield:
         self.grid = torch.cartesian_prod(*axes).reshape(-1, m) if per_dimension**m <= 4 * _MOST else torch.zeros(0, m)
 
     @torch.no_grad()
-    def __call__(self, latent: Tensor, wanted: Tensor) -> Protected:
+    def __call__(self, latent: Tensor, wanted: Tensor, own: Tensor | None = None) -> Protected:
         """Actions ``(n, m)`` in place of wanted ones ``(n, m)``, in physical units, at latents ``(n, p)``.
 
-        What lies beyond the range is clipped. A ShapeError for another size, a NonFiniteError for NaN.
+        What lies beyond the range is clipped. ``own``: the agent's own actions at these latents, where they are known already.
+        A ShapeError for another size, a NonFiniteError for NaN.
         """
         m = len(self.scale)
-        if wanted.shape != (len(latent), m):
-            raise ShapeError(f"expected actions of shape ({len(latent)}, {m}), received {tuple(wanted.shape)}")
+        for given in (wanted,) if own is None else (wanted, own):
+            if given.shape != (len(latent), m):
+                raise ShapeError(f"expected actions of shape ({len(latent)}, {m}), received {tuple(given.shape)}")
         if not bool(wanted.isfinite().all()):
             raise NonFiniteError("expected finite actions, received NaN or infinity from the policy that is to be protected")
         scale = self.scale.to(wanted)
         asked = wanted.clamp(-scale, scale)
-        own, inside = self.agent.policy(latent), self.agent.barrier(latent)[:, 0] <= 0.0
+        own, inside = self.agent.policy(latent) if own is None else own, self.agent.barrier(latent)[:, 0] <= 0.0
         after_own, after = self._after(latent.repeat(2, 1), torch.cat([own, asked])).chunk(2)
         most = after_own.clamp(self.level - self.margin, -self.margin)
         keeps = inside & ((after <= most) | (asked == own).all(1))  # [V] speaks of the agent's own

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
@@ -56,6 +56,7 @@ class Watched:
     action: Tensor  # (n, m) physical units, of the agent or of the fallback
     verdict: Tensor  # (n,) int64, see Verdict
     alarm: Tensor  # (n,) bool
+    applies: Tensor  # (n,) bool, whether the premise of the proof has held since the reset, during an alarm too
     barrier: Tensor  # (n,) B of the memory
     signals: dict[str, Tensor]  # (n,) by name; NaN where there is nothing to compare
     reasons: list[list[str]]  # of every row, the signals beyond their limits in this step
@@ -236,11 +237,11 @@ class Monitor:
             signals = {name: torch.full_like(step.barrier, math.nan) for name in SIGNALS}
             return self._decided(step, signals, [[fault, *found] for found in reasons])
         signals = {"innovation": step.innovation.masked_fill(fresh, math.nan)} | self._looked_at(pixels, step.seen, fresh)
-        for name in self.signals:
-            value, (low, high) = signals[name], self.calibration.limits[name]
-            beyond = (value > high) | (value < low) | value.isinf()
-            for k in beyond.nonzero()[:, 0].tolist():
-                reasons[k].append(name)
+        if self.signals:
+            value = torch.stack([signals[name] for name in self.signals], 1)
+            low, high = value.new_tensor([self.calibration.limits[name] for name in self.signals]).unbind(1)
+            for k, which in ((value > high) | (value < low) | value.isinf()).nonzero().tolist():
+                reasons[k].append(self.signals[which])
         return self._decided(step, signals, reasons)
 
     def took(self, action: Tensor) -> None:
@@ -291,7 +292,7 @@ class Monitor:
         alarm = self._quiet < self.clear_after
         verdict = torch.where(step.applies, Verdict.PROOF_APPLIES, Verdict.INSIDE)
         verdict = torch.where(step.inside, verdict, Verdict.OUTSIDE).masked_fill(alarm, Verdict.UNKNOWN_PICTURE)
-        told = Watched(step.action, verdict, alarm, step.barrier, signals, reasons, step.latent)
+        told = Watched(step.action, verdict, alarm, step.applies, step.barrier, signals, reasons, step.latent)
         if bool(alarm.any()) and self.fallback != "policy":
             action = step.action
             other = torch.zeros_like(action) if self.fallback == "stop" else self.fallback(told)  # type: ignore[operator]
@@ -309,6 +310,8 @@ def small(frame: Tensor) -> Tensor:
 
 def _apart(a: Tensor, b: Tensor) -> Tensor:
     """Mean difference of frames uint8, of 1."""
+    if torch.equal(a, b):  # as it is with every camera that works
+        return torch.zeros(len(a), device=a.device)
     return (a.float() - b.float()).abs().mean((1, 2, 3)) / 255.0
 
 
@@ -337,7 +340,7 @@ class Watching:
     ) -> None:
         self.agent, self.calibration, self.change, self.driver, self.options = agent, calibration, change, driver, options
         self.monitor: Monitor | None = None
-        self.chunks: list[list[tuple[Tensor, Mapping[str, Tensor], Tensor]]] = []  # alarms, signals and rows, by chunk and step
+        self.chunks: list[list[tuple[Watched, Tensor]]] = []  # what was told, and of which rows, by chunk and step
 
     def reset(self, rows: Tensor | None = None) -> None:
         """Forget everything, or some episodes."""
@@ -359,7 +362,7 @@ class Watching:
         if len(observation) < n:  # whoever is gone is shown nothing; it is looked at no more
             shown = torch.zeros(n, *observation.shape[1:], dtype=torch.uint8).index_copy(0, index, observation)
         out = self.monitor.step(shown if self.change is None else self.change(shown, len(steps)))
-        steps.append((out.alarm & torch.zeros(n, dtype=torch.bool).index_fill(0, index, True), out.signals, index))
+        steps.append((out, index))
         action = out.action[index]
         if self.driver is not None:
             action = self.driver.step(observation, rows).action
@@ -367,18 +370,32 @@ class Watching:
         return Decision(action=action, barrier=out.barrier[index], seen=out.barrier[index])
 
     def alarms(self) -> Tensor:
-        """``(T + 1, n)`` bool, of all episodes."""
-        return torch.cat([torch.stack([alarm for alarm, _, _ in chunk]) for chunk in self.chunks if chunk], 1)
+        """``(T + 1, n)`` bool, of all episodes, T steps being the longest."""
+        return self._over_time("alarm")
+
+    def applies(self) -> Tensor:
+        """Whether the premise of the proof has held so far, likewise."""
+        return self._over_time("applies")
+
+    def _over_time(self, name: str) -> Tensor:
+        """An entry of what was told, false of episodes that are over."""
+        longest, parts = max(map(len, self.chunks)), []
+        for chunk in filter(None, self.chunks):
+            part = torch.zeros(longest, len(chunk[0][0].alarm), dtype=torch.bool)
+            for t, (out, rows) in enumerate(chunk):
+                part[t, rows] = getattr(out, name)[rows]
+            parts.append(part)
+        return torch.cat(parts, 1)
 
     def extremes(self) -> dict[str, Tensor]:
         """Smallest and largest value of every signal in every episode, ``(2, n)``."""
         found: dict[str, list[Tensor]] = {name: [] for name in SIGNALS}
         for chunk in self.chunks:
             for name in SIGNALS if chunk else ():
-                low = torch.full((len(chunk[0][0]),), math.inf)
+                low = torch.full((len(chunk[0][0].alarm),), math.inf)
                 high = -low
-                for _, signals, rows in chunk:
-                    value = signals[name][rows]
+                for out, rows in chunk:
+                    value = out.signals[name][rows]
                     low[rows] = torch.minimum(low[rows], value.nan_to_num(nan=math.inf))
                     high[rows] = torch.maximum(high[rows], value.nan_to_num(nan=-math.inf))
                 found[name].append(torch.stack([low, high]))

@@ -15,7 +15,7 @@ from torchrl_sspl.envs.quadruped.camera import TopCamera
 from torchrl_sspl.envs.quadruped.controller import Measurement
 from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
 from torchrl_sspl.envs.quadruped.stage import Stage
-from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
+from torchrl_sspl.envs.quadruped.world import GROUND_FRICTION, add_obstacle, connect
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 
 _RENDER_SIZE = 512
@@ -43,6 +43,7 @@ class QuadrupedEnv(gymnasium.Env):
         arena_half_size, safe_half_size, unsafe_half_size, obstacle_shape, obstacle_half_size, obstacle_centre: as of
             ``DubinsEnv``. Feet reach 0.35 m from the base: up to an obstacle of 0.3 m nothing touches it while the base
             is outside U.
+        friction: coefficient of feet on the ground. The controller supposes no less than 0.6.
         meshes: draw the robot's meshes (thirty times slower); agents are trained on the plain shapes.
         render_mode: "rgb_array", "human" (a window) or None.
 
@@ -72,12 +73,14 @@ class QuadrupedEnv(gymnasium.Env):
         obstacle_shape: str = "square",
         obstacle_half_size: float = 0.3,
         obstacle_centre: Sequence[float] = (0.0, 0.0),
+        friction: float = GROUND_FRICTION,
         meshes: bool = False,
         render_mode: str | None = None,
     ) -> None:
         check_positive(
             max_yaw_rate=max_yaw_rate, speed=speed, dt=dt, arena_half_size=arena_half_size,
             safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size, obstacle_half_size=obstacle_half_size,
+            friction=friction,
         )  # fmt: skip
         if not obstacle_half_size <= unsafe_half_size < safe_half_size:
             raise ConfigError(
@@ -98,11 +101,13 @@ class QuadrupedEnv(gymnasium.Env):
         self._robot = WalkingRobot(self._client, meshes=meshes)
         if not QuadrupedEnv._gait:  # the same for every robot of the process; two seconds of simulation
             QuadrupedEnv._gait = self._robot.steady_gait()
+        self._client.changeDynamics(self._robot.ground, -1, lateralFriction=friction)
         self._obstacle = add_obstacle(self._client, obstacle_shape, obstacle_half_size, self.obstacle_centre.tolist())
         self._camera = TopCamera(self._client, image_size)
         self._large = TopCamera(self._client, _RENDER_SIZE)
         self._substeps = max(1, round(dt / self._robot.dt))
         self._frames: NDArray[np.uint8] | None = None
+        self._push = 0.0  # N, of the step that follows
         #: The robot after every time step of the physics (``physics_dt``, in s) in the last step, for films.
         self.motion: list[Measurement] = []
         self.physics_dt = self._robot.dt
@@ -130,6 +135,7 @@ class QuadrupedEnv(gymnasium.Env):
         x, y, heading = self._start() if pose is None else _numbers("pose", pose, 3)
         snapshot = self._gait[int(phase * len(self._gait)) % len(self._gait)]
         self._client.restoreState(self._memory)
+        self._push = 0.0
         # The frame of one step ago is a real one: start a step earlier, and walk straight ahead.
         back = self.speed * self.dt
         self._robot.place(snapshot, x - back * math.cos(heading), y - back * math.sin(heading), heading)
@@ -155,6 +161,13 @@ class QuadrupedEnv(gymnasium.Env):
         self._frames = np.concatenate([self._frames[3:], now])
         return self._frames.copy(), -info["cost"], info["fallen"] or info["left"], False, info
 
+    def push(self, impulse: float) -> None:
+        """Push the robot's base to its left by an impulse in N s, evenly during the next step; a negative one to its right.
+
+        A NonFiniteError unless it is finite.
+        """
+        self._push = _numbers("impulse", impulse, 1)[0] / (self._substeps * self.physics_dt)
+
     def render(self) -> NDArray[np.uint8] | None:  # type: ignore[override]
         """The top view, uint8 ``(512, 512, 3)``, in render mode "rgb_array"; a window follows by itself."""
         return self._large.capture() if self.render_mode == "rgb_array" else None
@@ -179,9 +192,12 @@ class QuadrupedEnv(gymnasium.Env):
         """Simulate one step at a yaw rate; whether the obstacle was touched."""
         contact, self.motion = False, []
         for _ in range(self._substeps):
+            if self._push:
+                self._robot.push(self._push)
             self._robot.step([self.speed, 0.0, rate])
             self.motion.append(self._robot.measured)
             contact = contact or bool(self._client.getContactPoints(self._robot.body_id, self._obstacle))
+        self._push = 0.0
         return contact
 
     def _start(self) -> tuple[float, float, float]:

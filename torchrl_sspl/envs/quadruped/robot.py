@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,6 +65,13 @@ class WalkingRobot:
         """Stand still with the feet on the ground, at (x, y) in m with a heading in rad."""
         self._set_standing(x, y, heading, centre=float(self.controller.body.centre[0]))
         self.controller.reset(self.measured)
+
+    def push(self, force: float) -> None:
+        """Push the base to its left with a horizontal force in N, during the next ``dt``; a negative one to its right."""
+        heading = self.pose[2]
+        place = self.client.getBasePositionAndOrientation(self.body_id)[0]  # of the centre of mass
+        aside = [-force * math.sin(heading), force * math.cos(heading), 0.0]
+        self.client.applyExternalForce(self.body_id, -1, aside, place, self.client.WORLD_FRAME)
 
     def step(self, command: Array | list[float]) -> None:
         """Walk for ``dt`` at a command ``(3,)``: forward and lateral velocity in m/s, yaw rate in rad/s.

@@ -23,7 +23,7 @@ _TRUNK_COLOUR = (0.10, 0.25, 0.85, 1.0)
 _LEG_COLOUR = (0.20, 0.20, 0.22, 1.0)
 _HEAD_COLOUR = (1.0, 0.85, 0.0, 1.0)
 _HEAD_PLATE = {"xyz": "0.2 0 0.06", "size": "0.14 0.24 0.02"}
-_GROUND_FRICTION, _TOE_FRICTION = 0.9, 1.0
+GROUND_FRICTION, _TOE_FRICTION = 0.9, 1.0  # coefficients; those of two bodies that touch are multiplied
 _SHAPES = ("square", "disc")
 
 
@@ -67,7 +67,7 @@ def add_ground(client: Any) -> int:
     """An endless level ground; nothing of it is drawn, so that frames show robot and obstacle alone."""
     shape = client.createCollisionShape(client.GEOM_PLANE)
     ground = client.createMultiBody(0, shape)
-    client.changeDynamics(ground, -1, lateralFriction=_GROUND_FRICTION)
+    client.changeDynamics(ground, -1, lateralFriction=GROUND_FRICTION)
     client.changeVisualShape(ground, -1, rgbaColor=[0, 0, 0, 0])
     return ground
 
