@@ -13,6 +13,8 @@ from torchrl_sspl.modules.moments import FAINT, NOISE, REACH, WHOLE, Fitted, bac
 _MARKS = 4  # pixels of what stands still by which the camera's place is told
 _PER_PIXEL = 4  # places that are tried, per pixel of 64 and axis
 _SURE = 0.02  # mean squared difference by which another place has to fit better to be believed
+_GLARE, _LIKE = 1.05, 0.004  # brightness from which white may be cut off, and mean squared difference at which it is believed
+_WHITE = 1.0 - 1.5 / 127.5
 
 
 class Contrast(nn.Module):
@@ -47,6 +49,7 @@ class Contrast(nn.Module):
     light: Tensor
     shifts: Tensor
     marks: Tensor
+    index: Tensor
     around: Tensor
     weights: Tensor
 
@@ -59,6 +62,7 @@ class Contrast(nn.Module):
         self.register_buffer("shifts", torch.cartesian_prod(along, along), persistent=False)  # (s, 2) pixels, down and to the right
         n = len(self.shifts)
         self.register_buffer("marks", torch.zeros(channels, 0), persistent=False)  # colours of the pixels by which places are told
+        self.register_buffer("index", torch.zeros(0, dtype=torch.long), persistent=False)  # where these are
         self.register_buffer("around", torch.zeros(0, dtype=torch.long), persistent=False)  # pixels around them, at any place
         self.register_buffer("weights", torch.zeros(0, n, 0), persistent=False)  # of these, for every place and mark
         self._look()
@@ -73,7 +77,7 @@ class Contrast(nn.Module):
         at = torch.stack([index // size, index % size], -1) + self.shifts[:, None]  # (s, k, 2)
         pixels = torch.cartesian_prod(torch.arange(size), torch.arange(size)).to(at.device)
         near = (1.0 - (pixels[:, None, None] - at.clamp(0, size - 1)).abs()).clamp_min(0.0).prod(-1)  # bilinear: (H W, s, k)
-        self.around = (near > 0).any(-1).any(-1).nonzero()[:, 0]
+        self.index, self.around = index, (near > 0).any(-1).any(-1).nonzero()[:, 0]
         self.marks, self.weights = self.background.flatten(1)[:, index], near[self.around]
 
     def _load_from_state_dict(self, *arguments: Any) -> None:
@@ -86,6 +90,17 @@ class Contrast(nn.Module):
         self.background.copy_(background_of(frames))
         self.light.copy_((frames + 1.0).mean((-2, -1)).median(0).values)
         self._look()
+
+    def without_glare(self, frames: Tensor) -> Tensor:
+        """Frames ``(n, c, H, W)`` of a camera so bright that white is cut off, as what stands still shows them; others as they are."""
+        if not self.marks.shape[1]:
+            return frames
+        seen, known = frames.flatten(2)[:, :, self.index] + 1.0, self.marks + 1.0
+        gain = (seen * known).sum((1, 2), keepdim=True) / known.square().sum()
+        believed = (gain > _GLARE) & ((seen - gain * known).square().mean((1, 2), keepdim=True) < _LIKE)
+        gain = torch.where(believed, gain, 1.0)[..., None]
+        cut = (frames > _WHITE) & ((self.background + 1.0) * gain > _WHITE + 1.0)
+        return torch.where(cut, self.background, (frames + 1.0) / gain - 1.0)
 
     def in_place(self, frames: Tensor) -> Tensor:
         """Frames ``(n, c, H, W)`` as a camera that is in its place sees them."""
@@ -107,6 +122,7 @@ class Contrast(nn.Module):
         return in_parts(self._differences, frames)
 
     def _differences(self, frames: Tensor) -> Tensor:
+        frames = self.without_glare(frames)
         light = (frames + 1.0).mean((-2, -1))
         factor = (self.light / light.clamp_min(1e-3)).clamp(0.5, 2.0)[..., None, None]
         off = F.avg_pool2d(self.in_place((frames + 1.0) * factor - 1.0) - self.background, 2)
