@@ -23,8 +23,8 @@ _MIME = {
     ".svg": "image/svg+xml", ".mp4": "video/mp4", ".webm": "video/webm",
 }  # fmt: skip
 _ASSUMED = (
-    "Camera, physics and starts stay as they were measured: starts are drawn uniformly from the named set, and a grid is read as "
-    "such a sample.",
+    "Camera, physics and starts stay as they were during the measurements; starts are drawn uniformly from the set that is named, "
+    "and a grid counts as such a sample.",
     "The labels of S and U are right.",
     "Nothing is said about other cameras, other physics or states outside the state space.",
 )
