@@ -20,18 +20,18 @@ _USAGE = """sspl COMMAND ...
   train     train an agent, evaluate it and write its report; `sspl train --help` lists every field
   evaluate  measure an agent again, on fresh data
   verify    check the certificates of an agent again
-  compare   a page with several runs beside each other
+  compare   a page with several runs side by side
   watch     see an agent at work (picture, barrier, verdict, interventions), or a training while it runs
   calibrate limits of the monitor's signals, from clean episodes of an agent's system
   export    one step of an agent as .onnx or .pt2"""
 _TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
 
-Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Started again with
-the same out_dir it continues where it was interrupted.
+Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Run it again with the
+same out_dir to resume it.
 
   env={envs}, or a .yaml file of your own, or env._target_=package.module:Env
   preset={presets}
-  -m, --multirun    every combination of values that are separated by commas, each in a process of its own
+  -m, --multirun    every combination of values that are separated by commas, each in its own process
   --launcher ray    on a Ray cluster; --jobs N: runs at a time
   --cfg job         print the configuration, train nothing
 

@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from torchrl_sspl.certification.rounding import down, up
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.pages import Badge, Cell, Picture, Table, render
@@ -77,11 +78,11 @@ def _plain(name: str, value: Any) -> dict[str, Any]:
 
 
 def _bound(m: Mapping[str, Any]) -> str:
-    """The 95 % bound of a share: one-sided where nothing (or everything) happened, else the interval."""
+    """The 95 % bound of a share, rounded outward: one-sided where nothing (or everything) happened, else the interval."""
     lower, upper, events, n = (m.get(k) for k in ("lower", "upper", "events", "n"))
     if lower is None or upper is None or any(isinstance(v, float) and math.isnan(v) for v in (lower, upper)):
         return "\u2013"
-    low, high = f"{100 * lower:.3g}", f"{100 * upper:.3g}"
+    low, high = down(100 * lower, 3), up(100 * upper, 3)
     if events == 0:
         return f"\u2264 {high} %"
     return f"\u2265 {low} %" if events is not None and events == n else f"{low} to {high} %"

@@ -10,6 +10,7 @@ import sys
 import threading
 import weakref
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import suppress
 from queue import SimpleQueue
 from typing import Any, BinaryIO
 
@@ -183,11 +184,9 @@ class StageProcess:
         return (_checked(drawn.get()) for _ in bodies)
 
     def _send(self, job: Any) -> None:
-        try:
+        with suppress(OSError):  # it has ended; whoever asks for a picture is told
             pickle.dump(job, self._process.stdin)  # type: ignore[arg-type]
             self._process.stdin.flush()  # type: ignore[union-attr]
-        except (OSError, ValueError):
-            pass  # it has ended; whoever asks for a picture is told
 
 
 def _checked(drawn: Any) -> NDArray[np.uint8]:
@@ -216,10 +215,8 @@ def _end(process: subprocess.Popen[bytes], jobs: SimpleQueue[Any]) -> None:
     process.terminate()
     process.wait()
     jobs.put(None)
-    try:
+    with suppress(OSError):
         process.stdin.close()  # type: ignore[union-attr]
-    except OSError:
-        pass
 
 
 def _serve(read: BinaryIO, write: BinaryIO) -> None:
