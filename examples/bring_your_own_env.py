@@ -1,4 +1,4 @@
-"""Your own system: a simulator that this library has never seen, S and U as predicates on its info, an own encoder.
+"""Your own system: a simulator that the library does not know, S and U as predicates on its info, and your own encoder.
 
 python examples/bring_your_own_env.py [key=value ...]     needs: pip install 'torchrl-sspl[viz,examples]'
 """

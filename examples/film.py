@@ -26,6 +26,7 @@ def main(name: str = "quadruped", path: str = "") -> None:
         openings = openings[-1:] if make else openings[:2]
     plane = Plane.of(env, env.system.state_names[:2])
     found = animate(film.scenes(openings), path, plane=plane, levels=film.levels({}), fps=film.rate)
+    film.close()
     print(f"{found}: {found.stat().st_size / 1e6:.1f} MB")
 
 

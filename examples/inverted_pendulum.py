@@ -4,8 +4,7 @@
 
 trains, evaluates on fresh data, certifies, and writes metrics.json, figures/, report.html and the agent into out_dir.
 Useful keys: seed=0, out_dir=runs/pendulum, preset=sound|paper|smoke, agent=pendulum (evaluate that one, train none). All
-settings are in torchrl_sspl/configs/env/pendulum.yaml. Started again with the same out_dir it continues where it was
-interrupted.
+settings are in torchrl_sspl/configs/env/pendulum.yaml. Run it again with the same out_dir to resume it.
 """
 
 import sys

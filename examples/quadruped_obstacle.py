@@ -2,7 +2,7 @@
 
     python examples/quadruped_obstacle.py [key=value ...]
 
-trains on a Dubins car that turns as late as the robot, evaluates on the paper's Dubins car against its true kernel and on
+trains on a Dubins car with the delay of the robot, evaluates on the paper's Dubins car against its true kernel and on
 the robot that walks in full physics, certifies, and writes metrics.json, figures/, report.html and the agent into out_dir.
 Useful keys:
 
@@ -11,8 +11,8 @@ Useful keys:
     evaluation.walks=200     walks in full physics from S, and as many from {B <= 0}; 0: none
     evaluation.episodes=0    nothing on the Dubins car
 
-All settings are in torchrl_sspl/configs/env/quadruped.yaml. Started again with the same out_dir a training continues where
-it was interrupted.
+All settings are in torchrl_sspl/configs/env/quadruped.yaml. Run it again with the same
+out_dir to resume a training.
 """
 
 import sys

@@ -20,18 +20,18 @@ _USAGE = """sspl COMMAND ...
   train     train an agent, evaluate it and write its report; `sspl train --help` lists every field
   evaluate  measure an agent again, on fresh data
   verify    check the certificates of an agent again
-  compare   a page with several runs beside each other
+  compare   a page with several runs side by side
   watch     see an agent at work (picture, barrier, verdict, interventions), or a training while it runs
   calibrate limits of the monitor's signals, from clean episodes of an agent's system
   export    one step of an agent as .onnx or .pt2"""
 _TRAIN = """sspl train env=NAME [key=value ...] [--multirun [--launcher local|ray] [--jobs N]] [--cfg job]
 
-Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Started again with
-the same out_dir it continues where it was interrupted.
+Trains, evaluates on fresh data and writes metrics.json, report.html and the agent into out_dir. Run it again with the
+same out_dir to resume it.
 
   env={envs}, or a .yaml file of your own, or env._target_=package.module:Env
   preset={presets}
-  -m, --multirun    every combination of values that are separated by commas, each in a process of its own
+  -m, --multirun    every combination of values that are separated by commas, each in its own process
   --launcher ray    on a Ray cluster; --jobs N: runs at a time
   --cfg job         print the configuration, train nothing
 
@@ -168,7 +168,7 @@ def _evaluate(words: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="sspl evaluate", description="Measure an agent on fresh data.", allow_abbrev=False)
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="fields of the evaluation, such as seed=7")
-    parser.add_argument("--json", metavar="FILE", help="write the measurements there too")
+    parser.add_argument("--json", metavar="FILE", help="also write the measurements to this file")
     parser.add_argument("--device", default="cpu", help="device of the networks")
     options = parser.parse_args(words)
     result = evaluate_agent(options.agent, options.overrides, device=options.device)
@@ -225,9 +225,9 @@ def _verify(words: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="sspl verify", description="Check the certificates of an agent again.")
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
-    text = "measure all episodes again, on the system that the agent names; runs its code, whoever wrote it"
+    text = "measure all episodes again, on the system that the agent names; this runs code that the agent names"
     parser.add_argument("--measure", action="store_true", help=text)
-    parser.add_argument("--seconds", type=float, default=900.0, help="most time for everything, without --measure (default: 900)")
+    parser.add_argument("--seconds", type=float, default=900.0, help="time limit, without --measure (default: 900)")
     options = parser.parse_args(words)
     from torchrl_sspl.evaluation.certify import verify_run
 
@@ -235,9 +235,9 @@ def _verify(words: list[str]) -> int:
 
 
 def _compare(words: list[str]) -> int:
-    """Write a page that shows runs beside each other, and print their table."""
-    parser = argparse.ArgumentParser(prog="sspl compare", description="Runs beside each other, on one page.")
-    parser.add_argument("runs", nargs="+", metavar="RUN", help="directories of runs; other files are passed over")
+    """Write a page that shows runs side by side, and print their table."""
+    parser = argparse.ArgumentParser(prog="sspl compare", description="Runs side by side, on one page.")
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="directories of runs; other files are ignored")
     parser.add_argument("--out", metavar="FILE", help="the page; default: comparison.html beside the runs")
     options = parser.parse_args(words)
     from torchrl_sspl.viz import compare as page
@@ -254,19 +254,19 @@ def _watch(words: list[str]) -> int:
     """Show an agent at work, or a training, on a page that is served from this machine."""
     text = "See an agent at work, or a training while it runs, on a page served from this machine."
     parser = argparse.ArgumentParser(prog="sspl watch", description=text)
-    text = "name of a shipped agent, such as pendulum, or a run directory: with a calibrated agent, that agent; else its training"
+    text = "name of a shipped agent, such as pendulum, or a run directory: shows its agent if that is calibrated, else its training"
     parser.add_argument("agent", help=text)
-    parser.add_argument("--env", help="a system as in `sspl train env=...`, or physics: its own one in full physics; default: its own one")
-    parser.add_argument("--video", metavar="FILE", help="a film in place of a system")
-    parser.add_argument("--policy", choices=("own", "random"), default="own", help="what acts (default: own)")
-    parser.add_argument("--filter", action="store_true", help="put the safety filter behind it")
-    parser.add_argument("--record", metavar="FILE.mp4", help="write a film of it")
-    parser.add_argument("--host", default="127.0.0.1", help="address of the page; another one than 127.0.0.1 shows it to others")
-    parser.add_argument("--port", type=int, default=8000, help="its port, 0: any that is free (default: 8000)")
-    parser.add_argument("--steps", type=int, help="end after so many (of a training: changes); default: with Ctrl-C")
+    parser.add_argument("--env", help="a system as in `sspl train env=...`, or physics: its own system in full physics; default: its own system")
+    parser.add_argument("--video", metavar="FILE", help="a film instead of a system")
+    parser.add_argument("--policy", choices=("own", "random"), default="own", help="the policy that acts (default: own)")
+    parser.add_argument("--filter", action="store_true", help="put the safety filter behind the policy")
+    parser.add_argument("--record", metavar="FILE.mp4", help="write a film of what is shown")
+    parser.add_argument("--host", default="127.0.0.1", help="address of the page; other machines can see it if this is not 127.0.0.1")
+    parser.add_argument("--port", type=int, default=8000, help="port of the page, 0: any free one (default: 8000)")
+    parser.add_argument("--steps", type=int, help="end after so many steps (of a training: changes); default: never, until Ctrl-C")
     parser.add_argument("--fps", type=float, help="steps per second; default: those of the system or the film")
-    parser.add_argument("--noise", type=float, default=1.0, help="of a system's camera, grey levels (default: 1)")
-    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    parser.add_argument("--noise", type=float, default=1.0, help="noise of the system's camera, grey levels (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
     given = parser.parse_args(words)
     from torchrl_sspl.viz.live import watch
 
@@ -280,15 +280,15 @@ def _watch(words: list[str]) -> int:
 
 
 def _calibrate(words: list[str]) -> int:
-    """Write the limits of the monitor's signals beside an agent."""
+    """Write the limits of the monitor's signals next to an agent."""
     parser = argparse.ArgumentParser(prog="sspl calibrate", description="Limits of the monitor's signals, from clean episodes.")
     parser.add_argument("agent", help="run directory, or name of a shipped agent")
     parser.add_argument("--out", metavar="DIRECTORY", help="where to write; default: the run directory")
-    parser.add_argument("--episodes", type=int, default=1000, help="for the limits; false alarms are as rare as they are many (default: 1000)")
-    parser.add_argument("--horizon", type=int, default=200, help="steps of each (default: 200)")
-    parser.add_argument("--pictures", type=int, default=20_000, help="for the model of clean pictures (default: 20000)")
-    parser.add_argument("--noise", type=float, default=1.0, help="of the camera, grey levels (default: 1)")
-    parser.add_argument("--seed", type=int, default=0, help="of what is drawn")
+    parser.add_argument("--episodes", type=int, default=1000, help="episodes for the limits; the more, the fewer false alarms (default: 1000)")
+    parser.add_argument("--horizon", type=int, default=200, help="steps per episode (default: 200)")
+    parser.add_argument("--pictures", type=int, default=20_000, help="pictures for the model of clean pictures (default: 20000)")
+    parser.add_argument("--noise", type=float, default=1.0, help="noise of the camera, grey levels (default: 1)")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
     given = parser.parse_args(words)
     from torchrl_sspl.evaluation.blocks import described_system
     from torchrl_sspl.modules.agent import Agent, agent_directory
@@ -301,7 +301,7 @@ def _calibrate(words: list[str]) -> int:
         )
     directory = agent_directory(given.agent)
     if given.out is None and directory.resolve().is_relative_to(Path(__file__).resolve().parent):
-        raise ConfigError(f"expected --out DIRECTORY with a shipped agent, received none; '{given.agent}' has a calibration of its own")
+        raise ConfigError(f"expected --out DIRECTORY with a shipped agent, received none; '{given.agent}' has its own calibration")
     agent = Agent.load(directory)
     factory = described_system(agent.description)
     env = None if factory is None else factory(batch_size=[1], seed=given.seed)

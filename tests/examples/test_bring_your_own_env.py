@@ -64,8 +64,8 @@ def test_from_the_simulator_to_the_report(name, example, tmp_path, monkeypatch):
     assert "Tiny" in page
     assert "data:video/mp4" in page
     assert "exact arithmetic on the deployed weights" in page
-    assert "What the weights prove" in page
-    assert "What fresh episodes show" in page
+    assert "Do the weights keep the set?" in page
+    assert "Do fresh episodes keep the set?" in page
     assert "episodes from B &lt;= 0 that touch U" in page or "touch_unsafe" in page
     for name in ("csv/scalars/loss_unsafe.csv", "csv/scalars/eval_touch_unsafe.csv", "csv/videos"):
         assert (tmp_path / name).exists()

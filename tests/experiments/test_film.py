@@ -23,6 +23,7 @@ def test_what_pushes_the_pendulum_over_does_not_do_so_behind_the_filter(pendulum
     opening = pendulum.env.system.openings[1]
     alone, protected = pendulum.scene(opening, seed=0).takes
     assert alone.said[-1] == ("in the unsafe set U", "bad")
+    assert not any("proof" in text for text, _ in alone.said)  # it is about what the agent does
     assert set(kinds(protected)) == {"good"}
     assert protected.said[0][0] == "inside: the proof applies"
     assert len(protected.said) == 51
@@ -54,16 +55,14 @@ def test_the_robot_hits_without_protection_and_passes_with_it_in_25_pictures_a_s
     pytest.importorskip("pybullet")
     env = DubinsEnv(seed=0)
     film = Film(sspl.load("quadruped"), env, world=env.physics()(), seconds=3.0)
-    try:
-        alone, learned = film.scene(env.system.openings[0], seed=0).takes
-    finally:
-        film.world.close()
+    alone, learned = film.scene(env.system.openings[0], seed=0).takes
+    first, second = (picture for picture, _ in zip(learned.pictures, range(2), strict=False))
+    film.close()
     assert film.rate == 25
     assert alone.said[-1] == ("hits the obstacle", "bad")
     assert learned.said[-1] == ("has left the arena: safe", "good")
     assert set(kinds(learned)) == {"good"}
     moved = (learned.states[1:, :2] - learned.states[:-1, :2]).norm(dim=-1)
     assert moved.mean() == pytest.approx(1.0 / 25, rel=0.05)  # at 1 m/s
-    first, second = (picture for picture, _ in zip(learned.pictures, range(2), strict=False))
     assert first.shape == (228, 228, 3)
     assert (first != second).any()

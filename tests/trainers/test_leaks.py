@@ -135,7 +135,7 @@ def test_collector_processes_and_temporary_files_are_gone_with_the_run(tmp_path,
     assert not left
     assert code == {"an exception": 1, "Control-C": 130, "killed": -9}.get(end, 0), text[-3000:]
     if end == "Control-C":
-        assert (text.count("goes on from there"), "Traceback" in text) == (1, False), text[-3000:]
+        assert (text.count("resumes from there"), "Traceback" in text) == (1, False), text[-3000:]
     assert end == "killed" or not list(folder.iterdir())
     assert end == "killed" or not Path(text.partition("sockets in ")[2].partition("\n")[0]).exists()
 

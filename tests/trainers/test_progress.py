@@ -29,13 +29,13 @@ def test_the_time_left_is_that_of_the_present_phase_by_its_own_pace(clock):
     for _ in range(10):
         clock.seconds += 6.0
         bar.tick(lambda: 0.25)
-    assert bar.eta() == "9 min left of this phase, then 3 more"
+    assert bar.eta() == "9 min left in this phase, then 3 more"
     bar.begin("fitting", 1000, taken=500, left=0)  # slow steps before say nothing of these
     assert bar.eta() == ""
     for _ in range(100):
         clock.seconds += 0.1
         bar.tick(lambda: None)
-    assert bar.eta() == "40 s left of this phase"
+    assert bar.eta() == "40 s left in this phase"
 
 
 def test_phase_loss_and_volume_are_in_the_bar_and_the_loss_is_asked_for_once_a_second(clock):
@@ -47,7 +47,7 @@ def test_phase_loss_and_volume_are_in_the_bar_and_the_loss_is_asked_for_once_a_s
         clock.seconds += 0.1
         bar.tick(lambda: asked.append(1) or 0.125)
     shown = file.getvalue()
-    for words in ("joint training", "loss 0.125", "safe set 62 % of what is not U".replace(" %", "%"), "left of this phase"):
+    for words in ("joint training", "loss 0.125", "safe set 62 % of the space outside U".replace(" %", "%"), "left in this phase"):
         assert words in shown
     assert 3 <= len(asked) <= 5
 
@@ -59,7 +59,7 @@ def test_a_file_says_the_same_without_a_bar_until_the_end(clock, tmp_path):
     for _ in range(4):
         clock.seconds += 2.0
         bar.tick(lambda: pytest.fail("a loss was asked for"))
-    assert json.loads(file.read_text()) == {"phase": "fitting", "done": 14, "total": 30, "left": "32 s left of this phase, then 2 more"}
+    assert json.loads(file.read_text()) == {"phase": "fitting", "done": 14, "total": 30, "left": "32 s left in this phase, then 2 more"}
     file.unlink()
     file.mkdir()  # what cannot be written does not end a training
     clock.seconds += 2.0
@@ -95,7 +95,7 @@ def test_every_round_ends_with_a_sentence(capsys):
     )
     Phases([Checked(0)], work, progress=True).run()
     said = "".join(capsys.readouterr())
-    assert "round 1: the safe set holds 62 % of what is not U; of up to 4,000 held-out episodes 2 left it, 0 met U" in said
+    assert "round 1: the safe set covers 62 % of the space outside U; of up to 4,000 held-out episodes 2 left it, 0 entered U" in said
     refused = Check(1, 0.0, 3, 0, 0, 0, 0.0, 0.4, False, "unsafe inside 3")
     assert round_line(refused, 10).endswith("not kept, because of: unsafe inside 3")
     assert "no safe set" in round_line(Check(1, 0.0, 0, 0, 0, 0, 0.0, 0.0, False, "the set is empty"), 10)

@@ -329,7 +329,7 @@ def test_a_signal_between_two_steps_on_a_batch_continues_bit_for_bit(tmp_path: P
     assert ended.value.code == 143
     assert first._optim_count == step  # the step's own hooks were done, no other step was begun
     assert "SIGTERM" in (said := capsys.readouterr().err)
-    assert "goes on from there" in said
+    assert "resumes from there" in said
     second = build(tmp_path / "broken", out_dir=tmp_path / "broken", **options)
     assert second.resume()
     assert second._optim_count == step

@@ -85,7 +85,7 @@ def runs(folder):
                 append(run / "log.jsonl", json.dumps({"phase": phase, "round": 0, "step": step, f"loss_{LONG}": 1 / step, "loss_safe": k}))
         append(run / "log.jsonl", json.dumps({"phase": "check", "round": 0, "step": 0, "size": 0.5, "reason": LONG}))
         write(run / "metrics.json", json.dumps({"config": config, "measurements": {"own": {LONG: {"value": 0.5 * k, "unit": "share"}}}}))
-    write(found[0] / "progress.json", json.dumps({"phase": LONG, "done": 1, "total": 2, "left": "4 min left of this phase, then 3 more"}))
+    write(found[0] / "progress.json", json.dumps({"phase": LONG, "done": 1, "total": 2, "left": "4 min left in this phase, then 3 more"}))
     return found
 
 

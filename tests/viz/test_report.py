@@ -199,7 +199,7 @@ def test_everything_is_escaped(tmp_path, where):
 
 def test_certificate_says_what_is_proved_measured_and_not_certified(tmp_path):
     _, text = full(tmp_path)
-    for words in ("What the weights prove", "kept &lt;always&gt;", "not proved, misses by 0.25 latent", "2,000, 95 %"):
+    for words in ("Do the weights keep the set?", "kept &lt;always&gt;", "not proved, misses by 0.25 latent", "2,000, 95 %"):
         assert words in text
 
 

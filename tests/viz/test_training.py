@@ -29,10 +29,10 @@ CHECK = {
     "phase": "check", "round": 0, "step": 0, "level": 0.0, "unsafe_inside": 0, "safe_outside": 0, "left": 2, "touched": 0, "returned": 0.98,
     "size": 0.62, "passed": True, "reason": "", "tolerated": 0.0, "covered": 0.0,
 }  # fmt: skip
-SENTENCE = "round 1: the safe set holds 62 % of what is not U; of up to 10 held-out episodes 2 left it, 0 met U"
+SENTENCE = "round 1: the safe set covers 62 % of the space outside U; of up to 10 held-out episodes 2 left it, 0 entered U"
 
 
-def begun(folder: Path, *rows: dict[str, Any], left: str = "4 min left of this phase, then 3 more") -> Path:
+def begun(folder: Path, *rows: dict[str, Any], left: str = "4 min left in this phase, then 3 more") -> Path:
     """The folder of a training that goes on."""
     write(folder / "config.json", json.dumps({"synthesis": {"check_episodes": 10}}))
     write(folder / "progress.json", json.dumps({"phase": "round 1 of 2: fitting", "done": 4200, "total": 9100, "left": left}))
@@ -80,13 +80,13 @@ def test_what_is_shown_changes_when_the_log_grows(tmp_path, monkeypatch):
     page = text_of(pages[0])
     assert "<title>sspl watch: run</title>" in pages[0]
     assert not re.search(r"(src|href)=\"(?!data:)|https?://|@import", pages[0])  # nothing from elsewhere
-    for words in ("Round 1 of 2: fitting", "4,200 of 9,100", "Loss 0.75", "none yet", "4 min left of this phase, then 3 more", "fit: unsafe"):
+    for words in ("Round 1 of 2: fitting", "4,200 of 9,100", "Loss 0.75", "none yet", "4 min left in this phase, then 3 more", "fit: unsafe"):
         assert words in page, words
     first, second = (text_of(event["html"]) for event in told)
     assert "None yet" in first
     assert SENTENCE not in first
     assert SENTENCE in second
-    assert "62 % of what is not U" in second.split("Held-out")[0]
+    assert "62 % of the space outside U" in second.split("Held-out")[0]
 
 
 def test_every_check_is_a_sentence_the_newest_first_and_only_what_passed_is_kept(tmp_path):
@@ -97,7 +97,7 @@ def test_every_check_is_a_sentence_the_newest_first_and_only_what_passed_is_kept
     assert found["checks"][0].text.endswith("not kept, because of: the log does not say")
     assert found["checks"][1].text.endswith("not kept, because of: left 7")
     assert found["checks"][2].text.startswith(SENTENCE)
-    assert dict(found["numbers"])["Safe set kept so far"] == "62 % of what is not U"
+    assert dict(found["numbers"])["Safe set kept so far"] == "62 % of the space outside U"
 
 
 def test_the_newest_phase_comes_first_with_its_losses(tmp_path):
@@ -113,7 +113,7 @@ def test_a_training_that_gives_no_sign_has_stopped_or_has_ended_says_so(tmp_path
     assert read_training(folder)["kind"] == "none"
     then = time.time() - 200
     os.utime(folder / "progress.json", (then, then))
-    assert read_training(folder)["more"].startswith("No sign of it for 4 min")
+    assert read_training(folder)["more"].startswith("No update for 4 min")
     (folder / "progress.json").unlink()
     stopped = read_training(folder)
     assert (stopped["headline"], stopped["kind"]) == ("Not running", "fair")

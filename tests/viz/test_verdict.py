@@ -32,19 +32,22 @@ def test_the_shipped_pendulum_is_safe_as_far_as_its_certificate_reaches():
     screen = first_screen(shipped("pendulum"), rows(0, 3000)[:1], trained=False)
     assert screen.kind == "good"
     assert screen.headline == (
-        "Safe as far as this reaches: the policy provably keeps the safe set {B <= 0} in the learned dynamics; none of 3,000 fresh "
-        "episodes left it or met U (at most 0.123 %); the proof reaches at least 99.1 % of them."
+        "Safe as far as this reaches: in the learned dynamics the policy provably never leaves the safe set {B <= 0}; none of 3,000 "
+        "fresh episodes left it or entered the unsafe set U (at most 0.123 %); the proof covers at least 99.3 % of them."
     )
     assert "Not certified: the paper's own conditions" in screen.more
-    assert "this run trains and proves nothing" in screen.more
-    assert screen.proved[0] == ("good", "In the learned dynamics the policy leads every latent with B <= 0 to one with B <= 0.")
+    assert "this run neither trained nor proved anything" in screen.more
+    assert screen.proved[0] == (
+        "good",
+        "In the learned dynamics the policy never leaves the safe set: it leads every latent with B <= 0 to one with B <= 0.",
+    )
     assert not any("rounding of the float64" in text or "known types" in text for _, text in screen.proved)
 
 
 def test_the_shipped_quadruped_is_safe_as_far_as_its_certificate_reaches():
     screen = first_screen(shipped("quadruped"), rows(0, 3000)[:1], trained=False)
     assert screen.kind == "good"
-    assert screen.headline.startswith("Safe as far as this reaches: the policy provably keeps the safe set {B <= 0} in the learned dynamics")
+    assert screen.headline.startswith("Safe as far as this reaches: in the learned dynamics the policy provably never leaves the safe set {B <= 0}")
     assert "Not certified: the paper's own conditions" in screen.more
 
 
@@ -60,7 +63,7 @@ def test_a_refuted_proof_is_said_first():
     screen = first_screen(certificate, rows(0, 3000), trained=False)
     assert screen.kind == "bad"
     assert screen.headline.startswith("Not certified as safe: the proof is refuted")
-    assert "20 of 3,000 fresh episodes left it or met U (at most 1.03 %)" in screen.headline
+    assert "20 of 3,000 fresh episodes left it or entered the unsafe set U (at most 1.03 %)" in screen.headline
     assert screen.proved[0][0] == "bad"
     assert "Refuted by a counterexample" in screen.proved[0][1]
     assert screen.measured[0][0] == "bad"
@@ -69,10 +72,12 @@ def test_a_refuted_proof_is_said_first():
 def test_few_episodes_are_never_green():
     screen = first_screen(shipped("pendulum"), rows(0, 50))
     assert screen.kind == "fair"
-    assert "this run is too small to confirm it" in screen.headline
+    assert "this run has too few episodes to confirm it" in screen.headline
     assert "none of 50 (at most 5.82 %)" in screen.more
-    assert ("fair", "episodes that touch U: none of 50 (95 %: at most 5.82 %; must be ≤ 1 %).") in screen.measured
+    assert ("fair", "Episodes that touch U: none of 50 (95 %: at most 5.82 %; must be ≤ 1 %).") in screen.measured
     assert screen.measured[-1] == ("none", "Not measured in this run: what nobody measured.")
+    many = requirement_rows([Requirement(f"lost {k}", f"lost {k}", "<=", 0.1, 0.0) for k in range(4)], Evaluation())
+    assert first_screen(None, many).measured == [("none", "Not measured in this run: 4 requirements, listed below.")]
 
 
 def test_a_missed_requirement_is_red_whatever_is_proved():

@@ -45,12 +45,12 @@ class NetworkConfig:
     policy_hidden: list[int] = _option([32, 32], "widths of the policy's hidden layers.")
     encoder: str = _option("FrameEncoder", 'name of an encoder of the library ("FrameEncoder": convolutions, '
         '"ContrastEncoder": convolutions on what differs from the background, "MomentEncoder": centres of colours before a background, "ShapeEncoder": place and direction of one thing of one '
-        'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves, "TurnedBearingEncoder": and how it is turned), or "package.module:Class" of your own, called with '
+        'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves, "TurnedBearingEncoder": and its orientation), or "package.module:Class" of your own, called with '
         'those of latent_dim, image_size, pool_to and velocity_gain that it takes.')
     pool_to: int = _option(32, "frames are averaged to this height and width before the first layer, in pixels.")
     velocity_gain: float = _option(4.0, "factor on the difference of the two frames' features.")
-    remember_action: bool = _option(False, "whether the last entries of the latent are the action before, for systems that act "
-        "late; of encoders that leave them to the memory (BearingEncoder).")
+    remember_action: bool = _option(False, "whether the last entries of the latent are the last action, for systems that act "
+        "with a delay; for encoders that leave these entries to the memory (BearingEncoder).")
 
 
 @dataclass
@@ -66,8 +66,8 @@ class LossConfig:
     inverse_dynamics_coeff: float | None = _option(None, "weight of reading the action from two latents.")
     variance_coeff: float | None = _option(None, "weight of the standard deviation that every latent dimension should "
         "reach.")
-    covariance_coeff: float | None = _option(None, "weight against latent dimensions that tell the same.")
-    saturation_coeff: float | None = _option(None, "weight of the penalty on latents that stick to their walls.")
+    covariance_coeff: float | None = _option(None, "weight of the penalty on correlated latent dimensions.")
+    saturation_coeff: float | None = _option(None, "weight of the penalty on saturated latents.")
     saturation_limit: float | None = _option(None, "size from which a latent counts as saturated.")
     synthesis_coeff: float | None = _option(None, "weight of the invariance condition.")
     policy_coeff: float | None = _option(None, "weight of the deviation from the user's policy.")
@@ -96,7 +96,7 @@ class CollectorConfig:
     random_share: float = _option(0.5, "share of the environments that act at random all the time; 1: the policy does "
         "not act.")
     starts: list[float] = _option([0.5, 0.0, 0.5, 0.0], "shares of the episodes that start anywhere, outside U, in S "
-        "and in U, where the environment knows its sets; others start as their resets say.")
+        "and in U, where the environment knows its sets; others start with their own resets.")
     ray_address: str = _option("", 'address of a running Ray cluster; "" starts a local one.')
 
 
@@ -140,7 +140,7 @@ class TrainerConfig:
     warm_start_steps: int = _option(1200, "of these, the first on the world model alone; -1: all of them, policy and "
         "barrier are left to the phases on frozen latents.")
     warm_start_error: float | None = _option(0.05, "share of S and U on the wrong side of the barrier, summed, down "
-        "to which the world model alone goes on being trained; null goes by the steps alone.")
+        "to which only the world model is trained; null: only warm_start_steps counts.")
     restarts: int = _option(2, "fresh starts with other initial weights, at most, where after warm_start_steps that "
         "share exceeds warm_start_error and no longer falls; 0 for none. Without a warm start there is nothing to "
         "judge by, and none happens.")
@@ -161,8 +161,8 @@ class SynthesisConfig:
     enabled: bool = _option(True, "whether they follow the joint training; never with loss.preset=paper, which trains "
         "as printed.")
     rounds: int = _option(1, "rounds of data, refit, synthesis and fine-tuning.")
-    gain: float = _option(1.0, "gain k of the latent observer: the latent is what was predicted, corrected by this share of "
-        "what is seen; 1: what is seen.")
+    gain: float = _option(1.0, "gain k of the latent observer: the latent is the prediction, moved by this share towards "
+        "what is seen; 1: only what is seen.")
     episode_steps: int | None = _option(None, "longest episode of the transitions collected for these phases; null is "
         "collector.max_frames_per_traj. An observer learns from episodes, not from single steps.")
     transitions: int = _option(40_000, "encoded transitions of the first round: those of the joint training and, "
@@ -177,22 +177,22 @@ class SynthesisConfig:
         "largest action.")
     dynamics_steps: int = _option(1500, "optimiser steps of the refit of the latent dynamics.")
     unsafe_weight: float = _option(1.0, "weight of transitions that start in U in the refit of the dynamics; below 1 "
-        "where what is seen there is not worth the networks' capacity (a robot before the obstacle it stands on).")
+        "where the pictures there are not worth the networks' capacity (a robot in front of the obstacle that it stands on).")
     tube_radius: float = _option(0.3, "distance from the data up to which a latent off the manifold may belong to the "
         "safe set.")
     grid: int = _option(0, "nodes per entry that pictures show of a grid over the latent domain, on which the barrier's targets are found "
         "by dynamic programming, under four times tolerated_error and with the actions of choices; for latents that the data fill. 0: the "
         "targets are found on the cloud of the data.")
     tolerated_error: float = _option(0.0, "error per step that the set is meant to be proved to tolerate, latent units: the "
-        "invariant set of the data keeps a quarter more, the fine-tuning asks the condition under the worst error of this size, and "
-        "then the counterexamples of the proof go back into the training. 0: residual_spread counts, and nothing is asked of the proof.")
+        "invariant set of the data keeps a quarter more, the fine-tuning requires the condition under the worst error of this size, and "
+        "then the training uses counterexamples of the proof. 0: residual_spread counts, and the proof is not considered.")
     residuals: int = _option(16, "observed errors of the dynamics per latent that the fine-tuning adds to successors.")
     residual_spread: float = _option(1.5, 'standard deviations of the local error that the invariant set of the data '
         'tolerates; with teacher "value" lowered by quarters where nine tenths of S could not be kept otherwise.')
     actions: int = _option(7, "actions per dimension tried at every latent.")
-    choices: int = _option(0, "actions per dimension from which the policy chooses, by the barrier of what they are predicted to "
-        "lead to, where its own would not keep the set; 0: it does not choose.")
-    choice_margin: float = _option(0.02, "barrier value below zero that its own action has to lead to, to be taken.")
+    choices: int = _option(0, "actions per dimension from which the policy chooses, by the barrier of the predicted next latent, "
+        "where its own action would not keep the set; 0: it does not choose.")
+    choice_margin: float = _option(0.02, "its own action is taken only if it leads at least this far below zero.")
     teacher: str = _option("value", 'what teaches the policy before the barrier is fitted: "clearance" (the action '
         'that ends farthest from what lies outside the invariant set, together with the barrier) or "value" (the '
         'action that keeps the largest distance from U on all that follows, before the barrier, which then learns '
@@ -219,8 +219,8 @@ class SynthesisConfig:
         "barrier).")
     leave_share: float = _option(0.00075, "largest share of the held-out episodes of a round that may leave the set; "
         "none may touch U.")
-    safe_share: float = _option(0.0, "share of the held-out pictures of S that may lie outside the set, where their noise asks for more "
-        "than can be kept; above zero the smallest change after a grid asks nothing of S.")
+    safe_share: float = _option(0.0, "share of the held-out pictures of S that may lie outside the set, where noise makes all of S too "
+        "much to keep; above zero, the smallest change after a grid has no condition on S.")
     cover_share: float = _option(0.0, "share of the held-out episodes to which the proof has to apply from the first step "
         "to the last; sets that reach it are preferred to all others. 0: no proof is tried before the end.")
     return_share: float = _option(0.97, "share of the held-out episodes from U that should end in the set; among sets "
@@ -237,7 +237,7 @@ class EvaluationConfig:
         "a fifth as many each from S and from U; 0: nothing is measured against the true kernel), else from its "
         "resets, and as many under random actions and to place the zero level.")
     horizon: int = _option(50, "steps per episode.")
-    envs: int = _option(20, "environments stepped together, of systems that are known by being run only.")
+    envs: int = _option(20, "environments stepped together, of systems that are only known by running them.")
     grid: int = _option(0, "states per dimension of the grid over the state space; 0: the system's own.")
     kernel_grid: int = _option(0, "states per dimension of the grid of the true kernel; 0: the system's own.")
     renderer_episodes: int = _option(0, "episodes on every further renderer of the system (0: not evaluated).")
@@ -266,7 +266,7 @@ class LoggerConfig:
 class Config:
     """Everything that determines a run; written beside its results."""
 
-    preset: str = _option("sound", '"sound" (what the library stands for), "paper" (losses and schedule as printed), '
+    preset: str = _option("sound", '"sound" (the recommended one), "paper" (losses and schedule as printed), '
         '"quick" (a first verdict in minutes) or "smoke" (seconds, for tests); a file each.')
     env: dict[str, Any] = _option(dict, "what is built: an import path ``_target_`` and its arguments.")
     network: NetworkConfig = _option(NetworkConfig, "networks.")

@@ -33,12 +33,12 @@ _REQUIREMENTS = (
     Requirement("latency_p99", "policy latency per frame, 99th percentile [ms]", "<=", 10.0, 5.0),
 )
 _LATE = (
-    "The certificate and the training are about the Dubins car that turns as late as the walking robot does; the true "
-    "kernel, and the Dubins episodes in the table, are those of the car that turns at once."
+    "Training and certificate are about a Dubins car that turns with the delay of the walking robot; the true kernel and the "
+    "Dubins episodes in the table are those of a car that turns at once."
 )
 _PHYSICS = (
-    "What the robot does in full physics is measured by its walks. There position and heading alone do not determine "
-    "the next step; the lag enters as an error that the set tolerates."
+    "The walks measure what the robot does in full physics. There, position and heading alone do not determine the next step; "
+    "the delay counts as an error that the set has to tolerate."
 )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -25,7 +26,7 @@ from torchrl_sspl.viz.animation import VIEW, Scene, Take
 _AFTER = 1.2  # s, for which what went wrong is still looked at
 _COLOURS = {"S": (205, 236, 205), "U": (250, 220, 215), "buffer": (255, 255, 255)}
 _GRID = {2: (61, 61), 3: (25, 25, 13)}  # nodes on which B is computed for its zero level
-_PROVED, _INSIDE, _OUTSIDE = ("inside: the proof applies", "good"), ("inside the safe set", "good"), ("outside of the safe set", "fair")
+_PROVED, _INSIDE, _OUTSIDE = ("inside: the proof applies", "good"), ("inside the safe set", "good"), ("outside the safe set", "fair")
 
 
 @dataclass
@@ -57,10 +58,27 @@ class Film:
     def _dt(self) -> float:
         return float(getattr(self.env, "dt", 0.05))
 
-    def scenes(self, openings: Iterable[Opening]) -> Iterator[Scene]:
-        """The scenes of some openings, each simulated when it is asked for."""
-        for k, opening in enumerate(openings):
-            yield self.scene(opening, seed=spawn(0, "report", k))
+    @functools.cached_property
+    def _stage(self) -> Any:
+        """Where the pictures of all takes are drawn; to paint its ground takes most of a second."""
+        return self.world.stage(VIEW, _COLOURS)
+
+    def close(self) -> None:
+        """End the full physics."""
+        for ended in (self.__dict__.pop("_stage", None), self.world):
+            if ended is not None:
+                ended.close()
+
+    def scenes(self, openings: Iterable[Opening], last: tuple[Opening, int] | None = None) -> Iterator[Scene]:
+        """The scenes of some openings, and of a last one with its seed; each simulated while those before it are drawn."""
+        seeded = [(opening, spawn(0, "report", k)) for k, opening in enumerate(openings)] + ([last] if last else [])
+        made = (self.scene(opening, seed=seed) for opening, seed in seeded)
+        ahead = next(made, None)
+        for following in made:
+            yield ahead  # type: ignore[misc]
+            ahead = following
+        if ahead is not None:
+            yield ahead
 
     def scene(self, opening: Opening, *, seed: int) -> Scene:
         """The same start twice: without protection, and with it."""
@@ -105,22 +123,21 @@ class Film:
         """A take with pictures between the steps."""
         dt = self.world.physics_dt
         bodies = recorder.bodies[: round((len(said) - 1) * self._dt / dt) + 1]
-        stage = self.world.stage(VIEW, _COLOURS)
         moments = [min(round(k / self.fps / dt), len(bodies) - 1) for k in range(round((len(bodies) - 1) * dt * self.fps) + 1)]
         step = [min(round(i * dt / self._dt - 0.499), len(said) - 1) for i in moments]
         poses = [[*bodies[i].position[:2], bodies[i].roll_pitch_yaw[2]] for i in moments]
         shown = episodes.frames[step, 0].permute(0, 2, 3, 1)
         values = None if episodes.barrier is None else episodes.barrier[step, 0]
-        pictures = stage.follow([bodies[i] for i in moments], 1 / self.fps)
+        pictures = self._stage.follow([bodies[i] for i in moments], 1 / self.fps)
         return Take(name, pictures, [said[t] for t in step], torch.tensor(poses), values, shown)
 
     def _said(self, episodes: Episodes, recorder: _Recorder | None, ends: bool) -> list[tuple[str, str]]:
         """What is known at every step: what the true state says, or else B.
 
-        ``ends``: whether the take ends some time after something went wrong.
+        ``ends``: whether nothing protects; the take then ends some time after something went wrong.
         """
         n = int(episodes.alive[:, 0].sum())
-        told = self._verdicts(episodes, n)
+        told = self._verdicts(episodes, n, proved=not ends)
         infos = [{}] * n if recorder is None else recorder.infos
         over, wrong = None, None
         for t in range(n):
@@ -137,16 +154,17 @@ class Film:
                 return told[: t + 1]
         return told
 
-    def _verdicts(self, episodes: Episodes, n: int) -> list[tuple[str, str]]:
+    def _verdicts(self, episodes: Episodes, n: int, proved: bool) -> list[tuple[str, str]]:
+        """What the barrier says at every step; ``proved``: whether what acts is what the proof is about."""
         barrier, seen = episodes.barrier, episodes.seen
         if barrier is None:
             return [("", "fair")] * n
         inside = barrier[:n, 0] <= 0.0
-        proved = torch.zeros(n, dtype=torch.bool)
-        if getattr(self.agent, "held_error", 0.0) > 0.0 and seen is not None:  # every picture so far has to agree
+        applies = torch.zeros(n, dtype=torch.bool)
+        if proved and getattr(self.agent, "held_error", 0.0) > 0.0 and seen is not None:  # every picture so far has to agree
             met = meets_premise(self.agent, barrier[:n, 0], seen[:n, 0], torch.zeros(n))
-            proved = met.cumprod(0).bool()
-        return [_PROVED if p else _INSIDE if i else _OUTSIDE for p, i in zip(proved.tolist(), inside.tolist(), strict=True)]
+            applies = met.cumprod(0).bool()
+        return [_PROVED if p else _INSIDE if i else _OUTSIDE for p, i in zip(applies.tolist(), inside.tolist(), strict=True)]
 
 
 def take_of(

@@ -23,20 +23,20 @@ def advice(certificate: Certificate | None, config: Config) -> list[str]:
     lines = []
     if reasons & {Reason.NOT_INVARIANT, Reason.MARGIN_TOO_SMALL, Reason.EPISODES_LEAVE}:
         lines.append(
-            "the set is led out of by what encoder and latent dynamics miss: as many latent numbers as the state has and the "
-            f"policy needs (network.latent_dim, now {net.latent_dim}), pictures in which a step moves more (action_repeat, a "
+            "encoder and latent dynamics miss something that leads out of the set; use as many latent numbers as the state has and "
+            f"the policy needs (network.latent_dim, now {net.latent_dim}), more motion between two pictures (action_repeat, a "
             f"closer camera; the default encoder averages them to network.pool_to = {net.pool_to} pixels), more data "
-            f"(trainer.total_frames, now {config.trainer.total_frames}), a U that can still be avoided from outside"
+            f"(trainer.total_frames, now {config.trainer.total_frames}), or a U that can still be avoided from outside"
         )
     if Reason.UNSAFE_INSIDE in reasons:
-        lines.append("observations of U that look like S: more data in U (reset_options), finer pictures (image_size, network.pool_to)")
+        lines.append("some observations of U look like S; use more data in U (reset_options) or finer pictures (image_size, network.pool_to)")
     if Reason.TOO_FEW in reasons or Reason.NOT_MEASURED in reasons:
         lines.append(
-            "too few fresh episodes start in the set, or show U: resets that do (reset_options), or more of them "
+            "too few fresh episodes start in the set or show U; use resets that do (reset_options), or more of them "
             f"(evaluation.certificate_episodes, now {e.certificate_episodes})"
         )
     if reasons & {Reason.UNDECIDED, Reason.VACUITY_UNDECIDED}:
-        lines.append(f"the proof ran out of time: more of it (evaluation.certificate_seconds, now {e.certificate_seconds:g})")
+        lines.append(f"the proof ran out of time; allow more (evaluation.certificate_seconds, now {e.certificate_seconds:g})")
     return lines
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -238,15 +237,14 @@ def _film(outcome: Outcome, env: SafetyEnv | None, folder: Path) -> tuple[Path |
         if not openings or arrays.get("trajectories") is None:
             return None, ""
     try:
-        scenes = film.scenes(openings)
+        last = None
         if closest is not None and in_physics is not None:
-            last = Opening(f"The closest of {len(in_physics)} measured walks", tuple(closest[0]))
-            scenes = itertools.chain(scenes, (film.scene(last, seed=closest[1]) for _ in range(1)))
+            last = Opening(f"The closest of {len(in_physics)} measured walks", tuple(closest[0])), closest[1]
+        scenes = film.scenes(openings, last)
         plane = _plane(twin) if twin.state_dim > 1 else None
         path = animate(scenes, path, plane=plane, levels=film.levels(arrays) if plane else None, fps=film.rate)
     finally:
-        if film.world is not None:
-            film.world.close()
+        film.close()
     return path, _CAPTION.format("in full physics" if closest is not None else "on the true dynamics")
 
 

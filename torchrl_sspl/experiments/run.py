@@ -78,7 +78,7 @@ def _alone(method: Callable[..., Any]) -> Any:
 
     @wraps(method)
     def wrapped(self: Experiment, **options: Any) -> Any:
-        with self._claim.held(), interruptible(lambda: f"what is saved stays in {self.directory}; the same command goes on from there"):
+        with self._claim.held(), interruptible(lambda: f"what is saved stays in {self.directory}; the same command resumes from there"):
             return method(self, **options)
 
     return wrapped

@@ -64,7 +64,7 @@ METRICS: Mapping[str, str] = MappingProxyType(
         "dynamics_margin": "margin eta in force",
         # Rounds of the two-time-scale training.
         "inside_of_allowed": "share of encoded data inside the robust invariant set",
-        "sweeps": "sweeps until that set stood still",
+        "sweeps": "sweeps until that set no longer changed",
         "level": "shift of the barrier with which a round's checks passed",
         "unsafe_inside": "held-out observations of U with B <= 0 (a number)",
         "safe_outside": "held-out observations of S with B > 0 (a number)",

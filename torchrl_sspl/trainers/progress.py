@@ -58,7 +58,7 @@ class Progress:
         self._bar = tqdm(total=total, initial=done, disable=not shown, bar_format=layout, dynamic_ncols=True, file=file)
         self.shown, self.n, self._note = shown, done, "resumed" if resumed else ""
         self._total, self._words, self._state = total, "", None if out_dir is None else out_dir / PROGRESS_FILE
-        self.kept: float | None = None  # share of what is not U in the set, so far
+        self.kept: float | None = None  # share of the space outside U in the set, so far
         self._began, self._first, self._size, self._left, self._looked = time.monotonic(), done, 0, 0, 0.0
         self.begin("starting", 0)
 
@@ -83,7 +83,7 @@ class Progress:
         if loss is not None:
             parts.append(f"loss {loss:.3g}")
         if self.kept is not None:
-            parts.append(f"safe set {self.kept:.0%} of what is not U")
+            parts.append(f"safe set {self.kept:.0%} of the space outside U")
         parts.append(self.eta())
         self._bar.set_postfix_str(", ".join(p for p in parts if p), refresh=self.shown)
         if self._state is not None:
@@ -96,7 +96,7 @@ class Progress:
         if self._size <= 1 or taken < 1:
             return f"{self._left} phases follow" if self._left > 0 else ""
         seconds = (time.monotonic() - self._began) / taken * max(0, self._size - taken)
-        return f"{spoken(seconds)} left of this phase{then}"
+        return f"{spoken(seconds)} left in this phase{then}"
 
     def move(self, n: int) -> None:
         """To a number of steps: a phase may take fewer than its size."""
@@ -136,16 +136,16 @@ def round_line(check: Any, episodes: int) -> str:
         >>> from types import SimpleNamespace
         >>> found = dict(round=0, size=0.62, left=1, touched=0, returned=0.98, passed=True, reason="", covered=0.0)
         >>> round_line(SimpleNamespace(**found), 4000)
-        'round 1: the safe set holds 62 % of what is not U; of up to 4,000 held-out episodes 1 left it, 0 met U; 98 % of the starts in U came back: kept'
+        'round 1: the safe set covers 62 % of the space outside U; of up to 4,000 held-out episodes 1 left it, 0 entered U; 98 % of the starts in U came back: kept'
     """
     head = f"round {check.round + 1}: "
     if not check.size:
         return f"{head}no safe set that passes was found ({check.reason or 'it is empty'})"
-    counts = f"of up to {episodes:,} held-out episodes {check.left:,} left it, {check.touched:,} met U"
-    proof = f"; the proof reaches {100 * check.covered:.3g} % of them" if check.covered else ""
+    counts = f"of up to {episodes:,} held-out episodes {check.left:,} left it, {check.touched:,} entered U"
+    proof = f"; the proof covers {100 * check.covered:.3g} % of them" if check.covered else ""
     verdict = "kept" if check.passed else f"not kept, because of: {check.reason}"
     back = f"{100 * check.returned:.3g} % of the starts in U came back"
-    return f"{head}the safe set holds {100 * check.size:.3g} % of what is not U; {counts}{proof}; {back}: {verdict}"
+    return f"{head}the safe set covers {100 * check.size:.3g} % of the space outside U; {counts}{proof}; {back}: {verdict}"
 
 
 __all__ = ["PROGRESS_FILE", "WORDS", "Progress", "round_line", "spoken"]

@@ -297,7 +297,7 @@ class SSPLTrainer(Trainer):
         rotation = self.checkpoint_rotation
         if rotation is None or rotation.latest() is None:
             return "nothing was saved"
-        return f"the state is in {rotation.latest()}; the same command goes on from there"
+        return f"the state is in {rotation.latest()}; the same command resumes from there"
 
     def _joint_steps(self) -> int:
         """Optimiser steps of the joint training, in all."""

@@ -8,10 +8,10 @@ from torchrl_sspl.viz.pages import Cell, Table, render
 from torchrl_sspl.viz.report import badge
 
 _TITLES = {
-    "run-time": "To how many real episodes the proof applies",
-    "deterministic": "What the weights prove",
-    "statistical": "What fresh episodes show",
-    "paper": "The paper's conditions, with its margins",
+    "run-time": "Does the proof cover real episodes?",
+    "deterministic": "Do the weights keep the set?",
+    "statistical": "Do fresh episodes keep the set?",
+    "paper": "Do the paper's conditions hold, with its margins?",
 }
 _SUCCESS = {"run-time": "yes", "deterministic": "proved", "statistical": "yes", "paper": "yes, all of them"}
 

@@ -415,7 +415,7 @@ def frames(env: Any, states: Any, *, captions: Sequence[str] | None = None, both
     pixels = env.observe(torch.as_tensor(states, dtype=torch.float32)).cpu()
     rows = 2 if both else 1
     lines = max(name.count("\n") for name in names) + 1
-    figure = new_figure(1.6 * n + 0.4, 1.6 * rows + 0.2 + 0.15 * lines, "What the agent sees of these states, and nothing else.")
+    figure = new_figure(1.6 * n + 0.4, 1.6 * rows + 0.2 + 0.15 * lines, "All that the agent sees of these states.")
     axes = figure.subplots(rows, n, squeeze=False)
     shown = [("step before", slice(0, 3)), ("now", slice(3, 6))][-rows:]
     for row, (time, channels) in zip(axes, shown, strict=True):

@@ -13,6 +13,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from torchrl_sspl.certification.rounding import down, up
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.pages import Badge, Cell, Picture, Table, render
@@ -23,8 +24,8 @@ _MIME = {
     ".svg": "image/svg+xml", ".mp4": "video/mp4", ".webm": "video/webm",
 }  # fmt: skip
 _ASSUMED = (
-    "Camera, physics and starts stay as they were measured: starts are drawn uniformly from the named set, and a grid is read as "
-    "such a sample.",
+    "Camera, physics and starts stay as they were during the measurements; starts are drawn uniformly from the set that is named, "
+    "and a grid counts as such a sample.",
     "The labels of S and U are right.",
     "Nothing is said about other cameras, other physics or states outside the state space.",
 )
@@ -77,11 +78,11 @@ def _plain(name: str, value: Any) -> dict[str, Any]:
 
 
 def _bound(m: Mapping[str, Any]) -> str:
-    """The 95 % bound of a share: one-sided where nothing (or everything) happened, else the interval."""
+    """The 95 % bound of a share, rounded outward: one-sided where nothing (or everything) happened, else the interval."""
     lower, upper, events, n = (m.get(k) for k in ("lower", "upper", "events", "n"))
     if lower is None or upper is None or any(isinstance(v, float) and math.isnan(v) for v in (lower, upper)):
         return "\u2013"
-    low, high = f"{100 * lower:.3g}", f"{100 * upper:.3g}"
+    low, high = down(100 * lower, 3), up(100 * upper, 3)
     if events == 0:
         return f"\u2264 {high} %"
     return f"\u2265 {low} %" if events is not None and events == n else f"{low} to {high} %"

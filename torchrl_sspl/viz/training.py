@@ -110,7 +110,7 @@ def read_training(directory: Path) -> dict[str, Any]:
         loss = sum(v for k, v in losses[-1].items() if k.startswith("loss"))
         numbers += [] if now else [("Last step", f"{losses[-1]['step']:,}")]
         numbers.append(("Loss", f"{loss:.3g}"))
-    numbers.append(("Safe set kept so far", f"{format_value(max(kept), 'share')} of what is not U" if kept else "none yet"))
+    numbers.append(("Safe set kept so far", f"{format_value(max(kept), 'share')} of the space outside U" if kept else "none yet"))
     numbers += [("Time left", now["left"] or "not known yet")] if now else []
     headline, kind, more = _state(directory, now, metrics, log)
     episodes = config.get("synthesis", {}).get("check_episodes", SynthesisConfig().check_episodes)
@@ -128,14 +128,14 @@ def _state(directory: Path, now: dict[str, Any], metrics: dict[str, Any], log: l
         with suppress(OSError):
             silent = time.time() - (directory / PROGRESS_FILE).stat().st_mtime
             if silent >= _SILENT:
-                return phase, "fair", f"No sign of it for {spoken(silent)}: a phase without steps takes long, or it was killed."
+                return phase, "fair", f"No update for {spoken(silent)}: a phase without steps is running, or it was killed."
         return phase, "none", ""
     if "measurements" in metrics:
         return "Trained and evaluated", "good", f"{metrics.get('stop_reason') or 'All phases are done'}. The result is in report.html."
     if (directory / "agent").is_dir():
-        return "Trained", "none", "Its evaluation is not done yet."
+        return "Trained", "none", "The evaluation is not finished yet."
     last = f"The last line of its log is of {_words(log[-1]['phase'])}, round {log[-1]['round'] + 1}. " if log else ""
-    return "Not running", "fair", last + "The command that began it goes on from the last checkpoint."
+    return "Not running", "fair", last + "Run the same command again to resume from the last checkpoint."
 
 
 def _check(row: dict[str, Any], episodes: int) -> Badge:

@@ -14,18 +14,19 @@ from torchrl_sspl.viz.report import format_value, verdict_kind
 Item = tuple[str, str]
 
 _MOST = 4  # rows of a run that the first screen shows
+_NAMED = 3  # requirements without a measurement that it names; of more it gives the number
 #: Measurements of what nobody wants, the most real first; a run's own sentence is about the first that it has.
 _HARM = ("walks_from_safe_hit", "walks_from_set_enter", "safe_rollouts_touch_unsafe", "touch_unsafe")
 #: What the statements of a proof mean, the most important first; of the others only those that fail are shown.
 _PROOFS = {
-    "invariance": "In the learned dynamics the policy leads every latent with B <= 0 to one with B <= 0.",
-    "float32": "The same of the float32 numbers that are computed, with an error of up to {} added to every step.",
-    "tolerated error": "The same in exact arithmetic, with an error of up to {} added to every step.",
-    "Lipschitz constant": "B changes by at most {} when the latent changes by 1 (exact arithmetic on the deployed weights).",
+    "invariance": "In the learned dynamics the policy never leaves the safe set: it leads every latent with B <= 0 to one with B <= 0.",
+    "float32": "The same in float32, as it is computed, with an error of up to {} added at every step.",
+    "tolerated error": "The same in exact arithmetic, with an error of up to {} added at every step.",
+    "Lipschitz constant": "B changes by at most {} times as much as the latent (exact arithmetic on the deployed weights).",
 }
 _UNPROVED = {
     Reason.EMPTY: "No safe set was found: no latent has B <= 0.",
-    Reason.EVERYTHING: "The safe set is everything, so that it says nothing.",
+    Reason.EVERYTHING: "The safe set is everything, and so says nothing.",
     Reason.NOT_INVARIANT: "Refuted by a counterexample: the policy leads a latent with B <= 0 to one with B > 0, in the learned dynamics.",
 }
 _CLAUSES = {
@@ -73,7 +74,8 @@ def first_screen(
     if len(found) > _MOST:
         found = [*found[:_MOST], ("none", f"{len(found) - _MOST} more below.")]
     if unknown:
-        found.append(("none", f"Not measured in this run: {'; '.join(unknown)}."))
+        what = f"{len(unknown)} requirements, listed below" if len(unknown) > _NAMED else "; ".join(unknown)
+        found.append(("none", f"Not measured in this run: {what}."))
     found += [("none", line) for line in measured]
     if certificate is None:
         kind = "bad" if "bad" in kinds else "none"
@@ -90,7 +92,7 @@ def first_screen(
     said = _word(proof, of_parts, of_rows) + ": " + "; ".join(text for _, text in parts) + "."
     paper = certificate.layers.get("paper")
     more = [] if paper is None or paper.holds else ["Not certified: the paper's own conditions with its margins"]
-    more += _of_run(rows, kinds) + ([] if trained else ["The certificate came with the agent; this run trains and proves nothing"])
+    more += _of_run(rows, kinds) + ([] if trained else ["The certificate came with the agent; this run neither trained nor proved anything"])
     return FirstScreen(said, worst, _joined(more), _proofs(proof), [*_evidence(certificate), *found])
 
 
@@ -113,12 +115,12 @@ def _word(proof: Layer, parts: Sequence[str], rows: Sequence[str]) -> str:
         return "Not certified as safe"
     if "bad" in rows:
         return "Certified, but this run misses requirements"
-    return "Certified, but this run is too small to confirm it" if "fair" in rows else "Safe as far as this reaches"
+    return "Certified, but this run has too few episodes to confirm it" if "fair" in rows else "Safe as far as this reaches"
 
 
 def _proof(layer: Layer) -> Item:
     if layer.holds:
-        return "good", "the policy provably keeps the safe set {B <= 0} in the learned dynamics"
+        return "good", "in the learned dynamics the policy provably never leaves the safe set {B <= 0}"
     reason = next(iter(layer.reasons), None)
     if reason in _CLAUSES:
         return "bad", _CLAUSES[reason]
@@ -132,15 +134,15 @@ def _counted(certificate: Certificate) -> Item:
     if total is None or not total.episodes or statement is None:
         return "none", "no fresh episode began in the safe set"
     most = "" if statement.value is None else f" (at most {up(100 * statement.value, 3)} %)"
-    text = f"{total.events or 'none'} of {total.episodes:,} fresh episodes left it or met U{most}"
+    text = f"{total.events or 'none'} of {total.episodes:,} fresh episodes left it or entered the unsafe set U{most}"
     return "good" if statement.holds else "bad", text
 
 
 def _covered(layer: Layer) -> Item:
     statement = _statement(layer, "covered")
     if statement is None or statement.value is None:
-        return "fair", "the proof applies to no real episode"
-    return "good" if statement.holds else "fair", f"the proof reaches at least {down(100 * (1 - statement.value), 3)} % of them"
+        return "fair", "the proof covers no real episode"
+    return "good" if statement.holds else "fair", f"the proof covers at least {down(100 * (1 - statement.value), 3)} % of them"
 
 
 def _statement(layer: Layer | None, name: str) -> Statement | None:
@@ -161,7 +163,7 @@ def _of_run(rows: Sequence[Sequence[Any]], kinds: Sequence[str]) -> list[str]:
     if bad:
         said.append(f"{bad} of {len(rows)} requirements {'is' if bad == 1 else 'are'} missed")
     if unsure:
-        said.append(f"For {unsure} of {len(rows)} requirements this run has too few episodes")
+        said.append(f"{unsure} of {len(rows)} requirements {'needs' if unsure == 1 else 'need'} more episodes")
     return said
 
 
@@ -175,7 +177,7 @@ def _line(row: Sequence[Any]) -> str:
         low = f"{down(100 * m.lower, 3)} %"
         bound = f"at least {low}" if m.events == m.n else f"{low} to {up(100 * m.upper, 3)} %"
     count = "none" if m.events == 0 else "all" if m.events == m.n else format_value(m.value, "share")
-    return f"{label}: {count} of {m.n:,} (95 %: {bound}; must be {must})."
+    return f"{label[:1].upper()}{label[1:]}: {count} of {m.n:,} (95 %: {bound}; must be {must})."
 
 
 def _proofs(layer: Layer) -> list[Item]:
@@ -211,7 +213,7 @@ def _evidence(certificate: Certificate) -> list[Item]:
     run_time = certificate.layers.get("run-time")
     if run_time is not None and certificate.layers["deterministic"].holds:
         kind, text = _covered(run_time)
-        items.append((kind, f"Certificate: {text}, from the first step to the last."))
+        items.append((kind, f"Certificate: {text}, at every step."))
     return items or [("none", "No fresh episode began in the safe set: nothing could be counted.")]
 
 

@@ -12,6 +12,7 @@ from torchrl_sspl.envs.quadruped.kinematics import (
     TOE_RADIUS,
     Array,
     Mask,
+    clip,
     cross,
     forward_kinematics,
     inverse_kinematics,
@@ -131,7 +132,7 @@ class WalkingController:
         wanted = check_command(command)
         m = self.memory
         now = m.steps * self.dt
-        used = m.command + np.clip(wanted - m.command, -self._slew, self._slew)
+        used = m.command + clip(wanted - m.command, -self._slew, self._slew)
         angles = measured.roll_pitch_yaw
         yaw = angles[2]
         lead = wrap_angle(m.heading + used[2] * self.dt - yaw)
@@ -139,7 +140,7 @@ class WalkingController:
         rotation = measured.rotation
         forward = rotation_z(yaw)
         error = used[:2] - (forward.T @ measured.velocity)[:2]
-        integral = np.clip(m.integral + _INTEGRATOR_GAIN * self.dt * error, -_INTEGRATOR_LIMIT, _INTEGRATOR_LIMIT)
+        integral = clip(m.integral + _INTEGRATOR_GAIN * self.dt * error, -_INTEGRATOR_LIMIT, _INTEGRATOR_LIMIT)
 
         phase = gait.phases(now)
         standing = phase < gait.DUTY
@@ -162,11 +163,11 @@ class WalkingController:
             away = position - measured.position
             velocity = (velocity - measured.velocity - cross(measured.angular_velocity, away)) @ rotation
             joints = inverse_kinematics(away @ rotation)
-            speeds = np.clip(_solve(jacobians, velocity), -_MAX_JOINT_SPEED, _MAX_JOINT_SPEED)
+            speeds = clip(_solve(jacobians, velocity), -_MAX_JOINT_SPEED, _MAX_JOINT_SPEED)
             torque = _STIFFNESS * (joints - measured.joints) + _DAMPING * (speeds - measured.joint_velocities)
             torques = np.where(standing[:, None], torques, torque)
         self.memory = Memory(m.steps + 1, used, float(yaw + lead), integral, forces, footholds, lift_off, standing)
-        return np.clip(torques, -_MAX_TORQUE, _MAX_TORQUE)
+        return clip(torques, -_MAX_TORQUE, _MAX_TORQUE)
 
     def _forces(
         self, measured: Measurement, angles: Array, feet: Array, footholds: Array, follow: Array, lead: float,

@@ -14,7 +14,7 @@ from torchrl_sspl.envs.base import check_positive
 from torchrl_sspl.envs.quadruped.camera import TopCamera
 from torchrl_sspl.envs.quadruped.controller import Measurement
 from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
-from torchrl_sspl.envs.quadruped.stage import Stage
+from torchrl_sspl.envs.quadruped.stage import StageProcess
 from torchrl_sspl.envs.quadruped.world import GROUND_FRICTION, add_obstacle, connect
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 
@@ -172,15 +172,16 @@ class QuadrupedEnv(gymnasium.Env):
         """The top view, uint8 ``(512, 512, 3)``, in render mode "rgb_array"; a window follows by itself."""
         return self._large.capture() if self.render_mode == "rgb_array" else None
 
-    def stage(self, size: int, colours: dict[str, tuple[int, int, int]]) -> Stage:
-        """A second world for pictures of ``motion``, ``size`` pixels high and wide; colours of "S", "U" and the "buffer"."""
+    def stage(self, size: int, colours: dict[str, tuple[int, int, int]]) -> StageProcess:
+        """A second world, in a process of its own, for pictures of ``motion``, ``size`` pixels high and wide; colours of "S", "U" and the
+        "buffer"."""
         centre = self.obstacle_centre.tolist()
         areas = [
             (self.arena_half_size, (0.0, 0.0), colours["S"]), (self.safe_half_size, centre, colours["buffer"]),
             (self.unsafe_half_size, centre, colours["U"]),
         ]  # fmt: skip
         shape, half = self.obstacle_shape, self.obstacle_half_size
-        return Stage(size, obstacle_shape=shape, obstacle_half_size=half, obstacle_centre=centre, areas=areas)
+        return StageProcess(size, obstacle_shape=shape, obstacle_half_size=half, obstacle_centre=centre, areas=areas)
 
     def close(self) -> None:
         """End the simulation; may be called more than once."""

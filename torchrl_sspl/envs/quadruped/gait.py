@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from torchrl_sspl.envs.quadruped.kinematics import SHOULDER, Array, rotation_z
+from torchrl_sspl.envs.quadruped.kinematics import SHOULDER, Array, columns, rotation_z
 
 GRAVITY = 9.81  # m/s^2
 HEIGHT = 0.28  # m, at which the base is held
@@ -60,7 +60,7 @@ def footholds(time: float, position: Array, velocity: Array, heading: float, com
         + _turn(heading + turned + half, SHOULDER[:, :2])
         + 0.5 * STANCE_TIME * velocity_then
         + _FEEDBACK * _turn(turned, planar - wanted)
-        + 0.5 * HEIGHT / GRAVITY * rate * np.stack([velocity_then[:, 1], -velocity_then[:, 0]], axis=1)
+        + 0.5 * HEIGHT / GRAVITY * rate * columns(velocity_then[:, 1], -velocity_then[:, 0])
     )
     return out
 
@@ -90,4 +90,4 @@ def _turn(angle: float | Array, vectors: Array) -> Array:
     """Rotate planar vectors by angles; both broadcast over the four feet."""
     cos, sin = np.cos(angle), np.sin(angle)
     x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+    return columns(cos * x - sin * y, sin * x + cos * y)

@@ -3,13 +3,22 @@
 from __future__ import annotations
 
 import math
+import os
+import pickle
+import subprocess
+import sys
+import threading
+import weakref
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from contextlib import suppress
+from queue import SimpleQueue
+from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter
 
+from torchrl_sspl.envs.quadruped.camera import RenderError
 from torchrl_sspl.envs.quadruped.controller import Measurement
 from torchrl_sspl.envs.quadruped.robot import WalkingRobot
 from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
@@ -139,3 +148,96 @@ class Stage:
         for part in (line, (slice(None), line)):
             ground[part] += 0.6 * (_GRID - ground[part])
         return np.stack([ground, *(uniform_filter(ground, (k, k, 1)) for k in _BLUR)]).astype(np.uint8)
+
+
+class StageProcess:
+    """A :class:`Stage` in a process of its own: it draws while the caller computes something else.
+
+    The arguments are those of ``Stage``. ``follow`` has the pictures drawn from then on, and gives the very same ones.
+
+    Raises RenderError where the process has ended, and what ``Stage`` raises, when the first picture is asked for. Source: none.
+
+    Example:
+        >>> stage = StageProcess(256)  # doctest: +SKIP
+        >>> pictures = stage.follow(env.motion, 0.002)  # doctest: +SKIP
+    """
+
+    def __init__(self, size: int = 256, **options: Any) -> None:
+        self._size, self._jobs = size, SimpleQueue[Any]()
+        paths = os.pathsep.join(os.path.abspath(path) for path in sys.path)
+        # Not multiprocessing: its children import the caller's script again, guarded or not. A session of its own: Ctrl-C is the caller's.
+        process = subprocess.Popen(
+            [sys.executable, "-m", __name__], stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True,
+            env=os.environ | {"PYTHONPATH": paths},
+        )  # fmt: skip
+        self._process, self.close = process, weakref.finalize(self, _end, process, self._jobs)
+        threading.Thread(target=_receive, args=(process.stdout, self._jobs, (size, size, 3)), daemon=True).start()
+        self._send({"size": size, **options})
+
+    def follow(self, bodies: Iterable[Measurement], dt: float) -> Iterator[NDArray[np.uint8]]:
+        """See ``Stage.follow``; drawing begins at once."""
+        if not self.close.alive:
+            raise RenderError("stage: expected one that is open, received a closed one.")
+        bodies, drawn = list(bodies), SimpleQueue[Any]()
+        self._jobs.put((len(bodies), drawn))
+        self._send((bodies, dt))
+        return (_checked(drawn.get()) for _ in bodies)
+
+    def _send(self, job: Any) -> None:
+        with suppress(OSError):  # it has ended; whoever asks for a picture is told
+            pickle.dump(job, self._process.stdin)  # type: ignore[arg-type]
+            self._process.stdin.flush()  # type: ignore[union-attr]
+
+
+def _checked(drawn: Any) -> NDArray[np.uint8]:
+    if isinstance(drawn, Exception):
+        raise drawn
+    return drawn  # type: ignore[no-any-return]
+
+
+def _receive(pipe: BinaryIO, jobs: SimpleQueue[Any], shape: tuple[int, int, int]) -> None:
+    """Hand out pictures as they come, or in place of each an error, until the jobs end."""
+    error: Exception | None
+    with pipe:
+        try:
+            error = pickle.load(pipe)
+        except EOFError:
+            error = RenderError("stage: expected pictures, received the end of the process that draws them.")
+        for count, drawn in iter(jobs.get, None):
+            for _ in range(count):
+                data = b"" if error else pipe.read(math.prod(shape))
+                if not error and len(data) < math.prod(shape):
+                    error = RenderError("stage: expected a picture, received the end of the process that draws them.")
+                drawn.put(error or np.frombuffer(data, np.uint8).reshape(shape))
+
+
+def _end(process: subprocess.Popen[bytes], jobs: SimpleQueue[Any]) -> None:
+    process.terminate()
+    process.wait()
+    jobs.put(None)
+    with suppress(OSError):
+        process.stdin.close()  # type: ignore[union-attr]
+
+
+def _serve(read: BinaryIO, write: BinaryIO) -> None:
+    """What the other process does: None or an error, then the pictures of every job."""
+    try:
+        stage, error = Stage(**pickle.load(read)), None
+    except Exception as problem:
+        stage, error = None, problem
+    pickle.dump(error, write)
+    write.flush()
+    while stage is not None:
+        try:
+            bodies, dt = pickle.load(read)
+        except EOFError:
+            return
+        for picture in stage.follow(bodies, dt):
+            write.write(picture.tobytes())
+        write.flush()
+
+
+if __name__ == "__main__":
+    pictures = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # PyBullet prints a line when it is imported
+    _serve(sys.stdin.buffer, pictures)
