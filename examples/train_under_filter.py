@@ -5,10 +5,10 @@
     python examples/train_under_filter.py seeds=0 batches=4   # a first look
     python examples/train_under_filter.py episodes=1000       # then run what the first seed learnt, 1,000 episodes each
 
-Three seeds each take about twenty minutes on one core. The learner sees the true state and knows nothing of the agent; the filter sees
-pictures alone. An episode ends where it enters U, so that the learner without a filter is told what to avoid. It prints tables, and
-writes `under_filter.png` and `under_filter.json` (for the car `under_filter_car.png` and `.json`) into `out_dir` (default:
-runs/under_filter).
+Three seeds each take about ten minutes on one core, the last of these a few more. The learner sees the true state and knows nothing of
+the agent; the filter sees pictures alone. An episode ends where it enters U, so that the learner without a filter is told what to avoid.
+It prints tables, and writes `under_filter.png` and `under_filter.json` (for the car `under_filter_car.png` and `.json`) into `out_dir`
+(default: runs/under_filter).
 """
 
 from __future__ import annotations
