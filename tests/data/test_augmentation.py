@@ -146,13 +146,3 @@ def test_what_is_collected_anew_is_changed_too(tmp_path):
 def test_a_share_that_is_none_is_refused_before_anything_is_computed(tmp_path):
     with pytest.raises(ConfigError, match="share"):
         Experiment(compose(["env=pendulum", "preset=smoke", f"out_dir={tmp_path}", "augmentation.share=2"]))
-
-
-def test_at_worst_every_episode_has_one_change_at_its_full_size():
-    frames = torch.full((300, 3, 8, 8), 100, dtype=torch.uint8)
-    changed = Augmentation(noise=12.0, brightness=0.15, shift=0.0).at_worst(3)(frames, torch.arange(300)).float()
-    mean, spread = changed.mean((1, 2, 3)), changed.std((1, 2, 3))
-    noisy = spread > 0
-    assert 0.3 < noisy.float().mean() < 0.7
-    assert spread[noisy].mean() == pytest.approx(12.0, abs=0.3)
-    assert set(mean[~noisy].tolist()) == {85.0, 115.0}

@@ -48,18 +48,11 @@ class Augmentation:
                 f"{share!r}, {noise!r}, {brightness!r} and {shift!r}"
             )
         self.share, self.noise, self.brightness, self.shift, self.seed = share, noise, brightness, shift, seed
-        self.worst = False
 
     def with_seed(self, seed: int) -> Augmentation:
         """The same changes, drawn anew."""
         other = copy.copy(self)
         other.seed = seed
-        return other
-
-    def at_worst(self, seed: int) -> Augmentation:
-        """The same drawn anew, every episode with one of the changes at its full size."""
-        other = self.with_seed(seed)
-        other.worst = True
         return other
 
     def __call__(self, frames: Tensor, episode: Tensor, position: int = 0) -> Tensor:
@@ -76,11 +69,6 @@ class Augmentation:
         cameras = int(episode.max()) + 1 if len(episode) else 0
         chosen = torch.rand(cameras, 3, generator=draw) < self.share
         drawn = torch.rand(cameras, 4, generator=draw)
-        if self.worst:
-            possible = torch.tensor([self.noise, self.brightness, self.shift]).nonzero()[:, 0]
-            kind = torch.randint(max(1, len(possible)), (cameras,), generator=draw)
-            chosen = F.one_hot(possible[kind], 3).bool() if len(possible) else torch.zeros_like(chosen)
-            drawn = torch.cat([torch.ones(cameras, 1), drawn[:, 1:].round()], 1)
         noise = chosen[:, 0] * self.noise * drawn[:, 0]
         factor = 1.0 + chosen[:, 1] * self.brightness * (2.0 * drawn[:, 1] - 1.0)
         shift = chosen[:, 2:] * self.shift * (2.0 * drawn[:, 2:] - 1.0)

@@ -13,7 +13,7 @@ from torchrl_sspl.modules.moments import FAINT, NOISE, REACH, WHOLE, Fitted, bac
 _MARKS = 4  # pixels of what stands still by which the camera's place is told
 _PER_PIXEL = 4  # places that are tried, per pixel of 64 and axis
 _SURE = 0.02  # mean squared difference by which another place has to fit better to be believed
-_GLARE, _LIKE = 1.05, 0.004  # brightness from which white may be cut off, and mean squared difference at which it is believed
+_GLARE, _LIKE = 1.05, 0.002  # brightness from which white may be cut off, and mean squared difference at which it is believed
 _WHITE = 1.0 - 1.5 / 127.5
 
 

@@ -34,7 +34,7 @@ class _Pictures:
     """Latents of fresh observations, and the states that episodes start from."""
 
     unsafe: Tensor
-    changed: Tensor | None  # the same of U, as the worst cameras of the training see them
+    changed: Tensor | None  # the same of U, as the cameras of the training see them
     safe: Tensor
     anywhere: Tensor
     states: Tensor  # of ``anywhere``
@@ -60,7 +60,7 @@ class CheckRound(Phase):
 
     The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations
     of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for; and where the training changes
-    its pictures, as many more, each with one of these changes at its full size, of which two in 100,000 may lie inside. A set is left from its rim,
+    its pictures, as many more, changed as these are, of which two in 100,000 may lie inside. A set is left from its rim,
     in the first steps, so many short episodes say more than few long ones. Where a proof is asked for, a level passes if the
     weights say that its set tolerates an error (branch and bound), the checks are made with the memory held in the set,
     and the proof applies to enough of the episodes. An observer that believes itself more than what it sees keeps a
@@ -135,7 +135,7 @@ class CheckRound(Phase):
             in_unsafe = env.sample_states(min(8 * n, _UNSAFE_DRAWS), generator, region=env.unsafe_set)
             unsafe, changed = encode_states(agent, env, in_unsafe), None
             if source.augmentation is not None:
-                cameras = source.augmentation.at_worst(spawn(work.seed, "checks", 2000 + self.number))
+                cameras = source.augmentation.with_seed(spawn(work.seed, "checks", 2000 + self.number))
                 changed = encode_states(agent, env, in_unsafe, augmentation=cameras)
             safe = encode_states(agent, env, env.sample_states(n, generator, region=env.safe_set))
             states = env.sample_states(3 * n, generator, region=source.outside_unsafe)
