@@ -106,6 +106,7 @@ class SafetyMethod(ABC):
         reads: ``"pixels"``, two stacked frames uint8 ``(n, 6, H, W)``, or ``"state"``, true states ``(n, s)``.
         learns: whether budget and seed matter.
         records: whether ``fit`` takes a recording.
+        pools: whether pictures are averaged for it to the size that the rivals share.
         needs: what it was given, complete after ``fit``.
         notes: figures of its own training.
         directory: where a training of its own may write; None: nowhere.
@@ -130,6 +131,7 @@ class SafetyMethod(ABC):
     reads: ClassVar[str] = "pixels"
     learns: ClassVar[bool] = True
     records: ClassVar[bool] = True
+    pools: ClassVar[bool] = True
     Config: ClassVar[type | None] = None
     needs: Needs = Needs()
 

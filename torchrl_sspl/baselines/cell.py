@@ -17,6 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_sspl.baselines.base import BUDGETS
 from torchrl_sspl.baselines.data import Recording, record
+from torchrl_sspl.baselines.pictures import Album
 from torchrl_sspl.baselines.registry import kind_of, make
 from torchrl_sspl.baselines.scoring import ScoreConfig, score, sizes_of
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
@@ -145,6 +146,12 @@ def _kernel(env: str, nodes: int) -> ViabilityKernel:
     return viability_kernel(made, resolution=sizes_of(made.system.kernel_grid, nodes))
 
 
+@functools.lru_cache(maxsize=1)
+def _album(env: str) -> Album:
+    """Pictures that all methods of a system are asked about."""
+    return Album(Cell("kernel", env).environment())
+
+
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Record, fit, score, write; or read what an earlier call has written.
 
@@ -173,7 +180,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
             method.fit(data, env, budget or BUDGETS["tiny"], cell.seed)
         used = time.process_time() - used
         clock.append(time.perf_counter())
-        found = score(method, env, cell.score, kernel=_kernel(cell.env, cell.score.kernel_grid))
+        found = score(method, env, cell.score, kernel=_kernel(cell.env, cell.score.kernel_grid), album=_album(cell.env))
         clock.append(time.perf_counter())
         minutes = {name: (b - a) / 60 for name, a, b in zip(("data", "fit", "score"), clock, clock[1:], strict=False)}
         row = {

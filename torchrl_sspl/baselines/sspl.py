@@ -37,7 +37,7 @@ class SSPLConfig:
 class SSPL(SafetyMethod):
     """SSPL, this library's own method: from a few labels, without states and model. Source: the paper."""
 
-    name, records = "sspl", False
+    name, records, pools = "sspl", False, False
     Config: ClassVar[type | None] = SSPLConfig
 
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:

@@ -75,7 +75,8 @@ def cells(words: Sequence[str]) -> list[Cell]:
         if env not in DEFAULTS and "methods" not in given:
             raise ConfigError(f"table: expected env among {', '.join(DEFAULTS)}, or methods= with it, received '{env}'")
         names = _names(given["methods"]) if "methods" in given else DEFAULTS[env]
-        for name, budget, seed in itertools.product(names, given.get("budget", "small").split(","), given.get("seed", "0").split(",")):
+        # Those of one recording one after the other: it is made once.
+        for budget, seed, name in itertools.product(given.get("budget", "small").split(","), given.get("seed", "0").split(","), names):
             method, *options = name.split(":")
             if not kind_of(method).learns or any(o.startswith("agent=") for o in options):
                 seed = "0"
