@@ -120,6 +120,23 @@ def barrier_on(method: SafetyMethod, env: SafetyEnv, state: Tensor, album: Album
     return torch.cat(values) if values else torch.zeros(0)
 
 
+def paths(method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal, horizon: int) -> tuple[Guarded, Tensor]:
+    """What acted from states ``(n, s)``, and ``(n,)`` which of the episodes enter U. Source: none.
+
+    Example:
+        >>> from torchrl_sspl.baselines import BUDGETS, make
+        >>> env, method = PixelPendulumEnv(), make("lqr")
+        >>> method.fit(None, env, BUDGETS["tiny"], 0)
+        >>> paths(method, env, torch.tensor([[0.1, 0.0], [1.5, 1.4]]), harmless(env), 9)[1]
+        tensor([False,  True])
+    """
+    acts = method.controller(nominal)
+    # Each frame is averaged once, not with every observation that holds it.
+    draw = (lambda state: pooled(env.draw(state))) if method.pools else env.draw
+    run = simulate(acts, env, start=start, horizon=horizon, draw=draw)
+    return acts, ((run.region == UNSAFE) & run.alive).any(0)
+
+
 @dataclass
 class _Score:
     """What the parts of a score share."""
@@ -139,12 +156,7 @@ class _Score:
         return torch.zeros(len(state), dtype=torch.bool) if value is None else value <= 0
 
     def episodes(self, start: Tensor, nominal: Nominal) -> tuple[Guarded, Tensor]:
-        """What acted, and which of the episodes enter U."""
-        acts, env = self.method.controller(nominal), self.env
-        # Each frame is averaged once, not with every observation that holds it.
-        draw = (lambda state: pooled(env.draw(state))) if self.method.pools else env.draw
-        run = simulate(acts, env, start=start, horizon=self.config.horizon, draw=draw)
-        return acts, ((run.region == UNSAFE) & run.alive).any(0)
+        return paths(self.method, self.env, start, nominal, self.config.horizon)
 
     def starts(self, keep, index: int) -> Tensor:
         generator = torch.Generator().manual_seed(self.config.seed + index)
@@ -340,4 +352,4 @@ def _shifted(it: _Score) -> None:
         _count_sets(it.out, f"shifted_{name}_", claimed <= 0, viable, unsafe)
 
 
-__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "middles", "score", "sizes_of", "well_inside"]
+__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "middles", "paths", "score", "sizes_of", "well_inside"]

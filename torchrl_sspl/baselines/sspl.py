@@ -66,6 +66,9 @@ class SSPL(SafetyMethod):
 
     name, records, pools = "sspl", False, False
     Config: ClassVar[type | None] = SSPLConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "overrides": ("[]", "[synthesis.residual_spread=1.0]", "[synthesis.residual_spread=2.0]", "[synthesis.margin=0.03]", "[synthesis.tune_steps=8000]"),
+    }  # fmt: skip
 
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Load the agent, or train one with the budget; see :meth:`SafetyMethod.fit`."""
