@@ -26,6 +26,7 @@ PURPOSES = {
     "benchmark": 13,
     "monitor": 14,  # clean episodes by which the monitor is calibrated
     "pictures": 15,  # changes of what cameras see
+    "labels": 16,  # which of few labels are wrong
 }
 _INDICES = 1 << 24
 _MASK = 0xFFFF_FFFF

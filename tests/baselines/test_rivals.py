@@ -16,10 +16,13 @@ from torchrl_sspl.baselines.neural_cbf import QuadraticBarrier
 from torchrl_sspl.baselines.perception import Coordinates, Perception, perception_error
 from torchrl_sspl.baselines.registry import kind_of
 from torchrl_sspl.baselines.scoring import adversarial, harmless, well_inside
+from torchrl_sspl.baselines.sspl import settings
 from torchrl_sspl.baselines.vision_cbf import Geometry
+from torchrl_sspl.configs import compose
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation import simulate
+from torchrl_sspl.experiments import Experiment
 from torchrl_sspl.viability import viability_kernel
 
 TINY = {
@@ -230,6 +233,27 @@ def test_layers_of_the_autoencoder_are_bounded_and_the_dynamics_are_affine():
     step, z = ControlAffine(4, 1, 0.05, 10.0), torch.randn(3, 4)
     at = [step(z, torch.full((3, 1), u)) for u in (-10.0, 0.0, 10.0)]
     assert torch.allclose(at[2] - at[1], at[1] - at[0], atol=1e-6)
+
+
+@pytest.mark.parametrize("system", ["pendulum", "dubins"])
+def test_this_librarys_own_row_takes_as_many_steps_as_recommended_whatever_the_budget(system, tmp_path):
+    quiet = ["logger=none", "trainer.progress=false"]
+    usual = Experiment(compose([f"env={system}", f"out_dir={tmp_path}/usual", *quiet])).trainer._joint_steps()
+    for name in ("small", "full"):
+        run = Experiment(compose([*settings(system, BUDGETS[name]), f"out_dir={tmp_path}/{name}", *quiet]))
+        assert run.trainer._joint_steps() == usual
+        assert run.config.trainer.total_frames <= BUDGETS[name].total + run.config.collector.frames_per_batch
+
+
+def test_a_heavier_hinge_is_another_barrier(systems):
+    env, _, data = systems["pendulum"]
+    found = []
+    for hinge in (1.0, 100.0):
+        torch.manual_seed(0)
+        method = make("latent_cbf", [*TINY["latent_cbf"], f"hinge={hinge}"])
+        method.fit(data, env, BUDGETS["tiny"], 0)
+        found.append(method.notes["barrier_loss"])
+    assert found[1] > 10 * found[0]
 
 
 def test_the_quadratic_barrier_falls_from_the_origin():

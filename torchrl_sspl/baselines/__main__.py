@@ -9,12 +9,12 @@ from torchrl_sspl.baselines.cell import Cell, run_cell, text
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.errors import SSPLError
 
-_USAGE = """python -m torchrl_sspl.baselines METHOD [env=pendulum|dubins] [budget=small|full] [seed=0] [out_dir=...] [key=value ...]
+_USAGE = """python -m torchrl_sspl.baselines METHOD [env=pendulum|dubins] [budget=small|full] [seed=0] [trials=8] [out_dir=...] [key=value ...]
 
 Fits a method, measures it and prints the row; score.episodes=... and the like are sizes of the measurement. What has been
 measured is read again, not measured again.
 
-python -m torchrl_sspl.baselines table [methods=NAME,NAME:key=value] [env=pendulum,dubins] [budget=small] [seed=0,1,2] [run=false]
+python -m torchrl_sspl.baselines table [methods=NAME,NAME:key=value] [env=pendulum,dubins] [budget=small] [seed=0,1,2] [trials=8] [run=false]
 
 Runs the cells that are missing and writes runs/baselines/table.md. METHOD is one of:
 """

@@ -106,10 +106,12 @@ class SafetyMethod(ABC):
         reads: ``"pixels"``, two stacked frames uint8 ``(n, 6, H, W)``, or ``"state"``, true states ``(n, s)``.
         learns: whether budget and seed matter.
         records: whether ``fit`` takes a recording.
+        pools: whether pictures are averaged for it to the size that the rivals share.
         needs: what it was given, complete after ``fit``.
         notes: figures of its own training.
         directory: where a training of its own may write; None: nowhere.
         Config: dataclass of its options.
+        space: what is tried where it is tuned, values by option.
 
     Source: none.
 
@@ -130,7 +132,9 @@ class SafetyMethod(ABC):
     reads: ClassVar[str] = "pixels"
     learns: ClassVar[bool] = True
     records: ClassVar[bool] = True
+    pools: ClassVar[bool] = True
     Config: ClassVar[type | None] = None
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {}
     needs: Needs = Needs()
 
     def __init__(self, config: Any = None) -> None:
@@ -264,11 +268,12 @@ class OneStepFilter(SafetyMethod):
 
     .. math:: u = \arg\min_v \lVert v - u_{wanted} \rVert \quad \text{with} \quad h(f(x, v)) \le \alpha\, h(x)
 
-    over an equally spaced grid of actions and the wanted one itself. A subclass gives ``perceive``, ``h`` and ``predict``.
-    Source: discrete-time control barrier functions.
+    over an equally spaced grid of actions and the wanted one itself; ``offset`` is added to h, in the claim and in the filter. A subclass
+    gives ``perceive``, ``h`` and ``predict``. Source: discrete-time control barrier functions.
     """
 
     alpha: float = 0.5
+    offset: float = 0.0
     grid: int = 21
     env: SafetyEnv
 
@@ -286,13 +291,17 @@ class OneStepFilter(SafetyMethod):
 
     def barrier(self, seen: Tensor) -> Tensor | None:
         """h of what is perceived."""
-        return self.h(self.perceive(seen))
+        return self.raised(self.perceive(seen))
+
+    def raised(self, state: Tensor) -> Tensor:
+        """h and the offset ``(n,)``."""
+        return self.h(state) + self.offset
 
     def after(self, state: Tensor, candidates: Tensor) -> Tensor:
         """h ``(n, k)`` of the successors of states ``(n, p)`` under ``(n, k, m)`` actions."""
         n, k, m = candidates.shape
         repeated = state[:, None].expand(n, k, state.shape[-1]).reshape(n * k, -1)
-        return self.h(self.predict(repeated, candidates.reshape(n * k, m))).reshape(n, k)
+        return self.raised(self.predict(repeated, candidates.reshape(n * k, m))).reshape(n, k)
 
     def candidates(self, wanted: Tensor) -> Tensor:
         """Actions that are tried, ``(n, k, m)``; the wanted one first."""
@@ -303,7 +312,7 @@ class OneStepFilter(SafetyMethod):
 
     def limit(self, state: Tensor) -> Tensor:
         """Largest value ``(n,)`` that a successor may have."""
-        return self.alpha * self.h(state)
+        return self.alpha * self.raised(state)
 
     @torch.no_grad()
     def act(self, seen: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import functools
 import json
+import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -15,8 +16,10 @@ import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from torchrl_sspl.baselines.base import BUDGETS
+from torchrl_sspl.baselines import tuning
+from torchrl_sspl.baselines.base import BUDGETS, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, record
+from torchrl_sspl.baselines.pictures import Album
 from torchrl_sspl.baselines.registry import kind_of, make
 from torchrl_sspl.baselines.scoring import ScoreConfig, score, sizes_of
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
@@ -27,9 +30,9 @@ from torchrl_sspl.modules.agent import WEIGHTS_FILE, agent_directory
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
-ROW_FILE = "row.json"
+ROW_FILE, TRIALS_FILE = "row.json", "trials.json"
 SCHEMA = 1
-_OWN = ("env", "budget", "seed", "out_dir")
+_OWN = ("env", "budget", "seed", "out_dir", "trials")
 
 
 @dataclass(frozen=True)
@@ -44,6 +47,7 @@ class Cell:
         options: ``key=value`` changes of the method's configuration.
         score: sizes of the measurements.
         out_dir: where the row is written.
+        trials: of the tuning, by which options are chosen first, see :mod:`~torchrl_sspl.baselines.tuning`; 0: none.
 
     Source: none.
     """
@@ -55,6 +59,7 @@ class Cell:
     options: tuple[str, ...] = ()
     score: ScoreConfig = field(default_factory=ScoreConfig)
     out_dir: str = ""
+    trials: int = 0
 
     @classmethod
     def of(cls, method: str, words: Sequence[str] = ()) -> Cell:
@@ -75,26 +80,30 @@ class Cell:
         make(method, options)  # an option that is not valid is named before anything is done
         if own.get("budget", "small") not in BUDGETS:
             raise ConfigError(f"expected budget to be one of {', '.join(BUDGETS)}, received '{own['budget']}'")
-        if not own.get("seed", "0").isdigit():
-            raise ConfigError(f"expected seed to be an integer >= 0, received '{own['seed']}'")
+        for number in ("seed", "trials"):
+            if not own.get(number, "0").isdigit():
+                raise ConfigError(f"expected {number} to be an integer >= 0, received '{own[number]}'")
         try:
             sizes: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ScoreConfig), OmegaConf.from_dotlist(scores)))
         except OmegaConfBaseException as error:
             valid = ", ".join(OmegaConf.structured(ScoreConfig))
             raise ConfigError(f"expected score.* among {valid}, received {scores} ({' '.join(str(error).split())})") from error
         budget = own.get("budget", "small") if kind.learns else "none"
-        return cls(method, own.get("env", "pendulum"), budget, int(own.get("seed", 0)), options, sizes, own.get("out_dir", ""))
+        trials = int(own.get("trials", 0)) if kind.learns else 0
+        return cls(method, own.get("env", "pendulum"), budget, int(own.get("seed", 0)), options, sizes, own.get("out_dir", ""), trials)
 
     @property
     def directory(self) -> Path:
         """Where the row lies: ``out_dir``, or one that names what determines it."""
-        name = "-".join([self.method, *(o.replace("=", "-").replace("/", "_") for o in self.options)])
+        name = "-".join([self.method, *(o.replace("=", "-").replace("/", "_") for o in self.options), *([f"trials-{self.trials}"] if self.trials else [])])
         return Path(self.out_dir or f"runs/baselines/{self.env}/{self.budget}/{name}/{self.seed}")
 
     def describe(self) -> dict[str, Any]:
         """Plain values that determine the row; where it lies is not among them."""
         body = asdict(self)
         body.pop("out_dir")
+        if not self.trials:
+            body.pop("trials")
         body["options"] = list(self.options)
         for agent in (o.removeprefix("agent=") for o in self.options if o.startswith("agent=")):
             body["weights"] = sha256((agent_directory(agent) / WEIGHTS_FILE).read_bytes()).hexdigest()
@@ -145,6 +154,40 @@ def _kernel(env: str, nodes: int) -> ViabilityKernel:
     return viability_kernel(made, resolution=sizes_of(made.system.kernel_grid, nodes))
 
 
+@functools.lru_cache(maxsize=1)
+def _album(env: str) -> Album:
+    """Pictures that all methods of a system are asked about."""
+    return Album(Cell("kernel", env).environment())
+
+
+def _fit(method: SafetyMethod, env: SafetyEnv, cell: Cell, seed: int) -> None:
+    """The method of a cell learns from the data of a seed."""
+    data = _recorded(cell.env, cell.budget, seed) if method.learns and method.records else None
+    with torch.random.fork_rng():
+        torch.manual_seed(spawn(seed, "weights"))
+        method.fit(data, env, BUDGETS.get(cell.budget, BUDGETS["tiny"]), seed)
+
+
+def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
+    """Options that trials have chosen, and the trials; they are the same for all scored seeds, and made once."""
+    path = (cell.directory if cell.out_dir else cell.directory.parent) / TRIALS_FILE
+    if path.is_file():
+        told = json.loads(path.read_text())
+        return told["chosen"], told["trials"]
+    env = replace(cell, seed=tuning.SEED).environment()
+
+    def trial(words: Sequence[str]) -> float:
+        method = make(cell.method, [*cell.options, *words])
+        with tempfile.TemporaryDirectory() as where:
+            method.directory = Path(where)
+            _fit(method, env, cell, tuning.SEED)
+            return tuning.merit(method, env, horizon=cell.score.horizon or 60)
+
+    chosen, trials = tuning.search(trial, tuning.draws(cell.method, cell.trials))
+    write(path, json.dumps({"chosen": list(chosen), "trials": trials}, indent=1) + "\n")
+    return chosen, trials
+
+
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Record, fit, score, write; or read what an earlier call has written.
 
@@ -162,24 +205,27 @@ def run_cell(cell: Cell) -> dict[str, Any]:
             return row
         from torchrl_sspl import __version__
 
-        env, method, budget = cell.environment(), make(cell.method, cell.options), BUDGETS.get(cell.budget)
+        env = cell.environment()
+        chosen, trials = _tuned(cell) if cell.trials else ((), [])
+        method = make(cell.method, [*cell.options, *chosen])
         method.directory = directory
         clock = [time.perf_counter()]
-        data = _recorded(cell.env, cell.budget, cell.seed) if budget is not None and method.learns and method.records else None
+        if method.learns and method.records:
+            _recorded(cell.env, cell.budget, cell.seed)
         clock.append(time.perf_counter())
         used = time.process_time()
-        with torch.random.fork_rng():
-            torch.manual_seed(spawn(cell.seed, "weights"))
-            method.fit(data, env, budget or BUDGETS["tiny"], cell.seed)
+        _fit(method, env, cell, cell.seed)
         used = time.process_time() - used
         clock.append(time.perf_counter())
-        found = score(method, env, cell.score, kernel=_kernel(cell.env, cell.score.kernel_grid))
+        found = score(method, env, cell.score, kernel=_kernel(cell.env, cell.score.kernel_grid), album=_album(cell.env))
         clock.append(time.perf_counter())
         minutes = {name: (b - a) / 60 for name, a, b in zip(("data", "fit", "score"), clock, clock[1:], strict=False)}
         row = {
             "schema": SCHEMA, "version": __version__, "cell": cell.describe(), "needs": asdict(method.needs),
             "minutes": minutes | {"fit_cpu": used / 60}, "measurements": found.to_dict(), "notes": method.notes,
         }  # fmt: skip
+        if cell.trials:
+            row["tuning"] = {"chosen": list(chosen), "trials": trials}
         write(directory / ROW_FILE, json.dumps(row, indent=1) + "\n")
         return row
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -94,6 +94,7 @@ class Imitation(SafetyMethod):
 
     name = "imitation"
     Config: ClassVar[type | None] = ImitationConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {"steps": (2000, 4000, 6000)}
     expert: KernelExpert | None = None
 
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:

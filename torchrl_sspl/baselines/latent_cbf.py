@@ -10,7 +10,7 @@ condition outside the labels asks for the best of a few actions, as the paper na
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -84,6 +84,8 @@ class LatentCBFConfig:
     inverse_dynamics: float = 0.0  # weight of reading the action from two latents, which the method lacks
     alpha: float = 0.9  # share of h that a step has to leave
     margin: float = 0.1  # of the hinges
+    hinge: float = 1.0  # their weight
+    offset: float = 0.0  # added to -h, in claim and filter
     tries: int = 7  # actions at which the condition is asked
 
 
@@ -97,11 +99,14 @@ class LatentCBF(OneStepFilter):
 
     name = "latent_cbf"
     Config: ClassVar[type | None] = LatentCBFConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "autoencoder_steps": (1200, 3600), "gain": (2.0, 4.0, 8.0), "hinge": (1.0, 10.0, 100.0), "alpha": (0.5, 0.8, 0.9), "offset": (0.0, 0.1, 0.3),
+    }  # fmt: skip
 
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Autoencoder, dynamics, barrier, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
-        self.env, self.alpha = env, c.alpha
+        self.env, self.alpha, self.offset = env, c.alpha, c.offset
         self.encoder = BoundedAutoencoder(c.latent, c.gain)
         self._reconstruct(data, seed)
         with torch.no_grad():
@@ -153,7 +158,7 @@ class LatentCBF(OneStepFilter):
             terms: dict[str, Tensor] = {}
             for name, index, sign in (("safe", own[0], 1.0), ("unsafe", own[1], -1.0)):
                 h = sign * self.barrier_net(z[index])[:, 0]
-                terms[f"loss_{name}"] = (c.margin - h).clamp_min(0).mean() if len(index) else h.sum()
+                terms[f"loss_{name}"] = c.hinge * (c.margin - h).clamp_min(0).mean() if len(index) else h.sum()
             at = z[rows]
             with torch.no_grad():
                 flat = at[:, None].expand(len(at), c.tries, at.shape[1]).reshape(-1, at.shape[1])

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from tensordict import TensorDict
@@ -55,6 +55,9 @@ class LatentSafe(SafetyMethod):
 
     name = "latent_safe"
     Config: ClassVar[type | None] = LatentSafeConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "world_steps": (2000, 6000), "discount": (0.98, 0.995, 0.999), "threshold": (0.0, 0.1, 0.2, 0.3), "actions": (21, 41),
+    }  # fmt: skip
 
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """World model, margin, value, one after the other; see :meth:`SafetyMethod.fit`."""

@@ -112,6 +112,9 @@ class NeRFCBF(OneStepFilter):
 
     name = "nerf_cbf"
     Config: ClassVar[type | None] = NeRFCBFConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "margin": (0.0, 0.1, 0.2), "beta": (0.5, 0.7, 1.0), "alpha": (0.5, 0.8, 0.9), "form": ("speed", "closing"),
+    }  # fmt: skip
 
     def __init__(self, config: Any = None) -> None:
         super().__init__(config)

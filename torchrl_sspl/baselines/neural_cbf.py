@@ -10,7 +10,7 @@ exists, h is a plain network of the coordinates.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -65,15 +65,17 @@ class NeuralCBFConfig:
     steps: int = 3000  # of barrier and controller
     rate: float = 1.0  # alpha of the condition, 1/s
     margin: float = 0.1  # gamma_1 of the hinges on S and U
+    hinge: float = 100.0  # weight of the hinges beside the condition's 10: a door in U costs the mean over U little
     slack: float = 0.01  # gamma_2 of the condition
     alpha: float = 0.95  # share of h that a step of the filter has to leave
+    offset: float = 0.0  # added to -h, in claim and filter
     batch: int = 512
 
 
 class NeuralCBF(OneStepFilter):
     r"""Neural CBF (Harms et al. 2024): barrier and controller on states, learnt with the exact model.
 
-    .. math:: L = \mathbb{E}_S [g_1 - h]_+ + \mathbb{E}_U [g_1 + h]_+ + \mathbb{E}_{h \ge 0} [g_2 - h(f(x, \pi)) + (1 - \alpha dt) h(x)]_+
+    .. math:: L = 100\,(\mathbb{E}_S [g_1 - h]_+ + \mathbb{E}_U [g_1 + h]_+) + 10\,\mathbb{E}_{h > 0} [g_2 - h(f(x, \pi)) + (1 - \alpha dt) h(x)]_+
         + 10^{-2} \mathbb{E} \lVert \pi / u_{max} \rVert^2
 
     Source: see the module.
@@ -81,11 +83,14 @@ class NeuralCBF(OneStepFilter):
 
     name = "neural_cbf"
     Config: ClassVar[type | None] = NeuralCBFConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "perception_steps": (2000, 6000), "steps": (3000, 6000), "rate": (0.3, 1.0, 3.0), "alpha": (0.5, 0.8, 0.95), "offset": (0.0, 0.05, 0.1),
+    }  # fmt: skip
 
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """State from pictures, then barrier and controller on states; see :meth:`SafetyMethod.fit`."""
         c = self.config
-        self.env, self.alpha = env, c.alpha
+        self.env, self.alpha, self.offset = env, c.alpha, c.offset
         self.eyes = Perception(env, data, c.perception_steps, seed)
         fresh = slice(0, min(1000, len(data)))
         self.notes |= perception_error(self.eyes(data.pixels[fresh]), data.state[fresh], env)
@@ -93,20 +98,22 @@ class NeuralCBF(OneStepFilter):
         self.net: nn.Module = QuadraticBarrier(at.high.clone()) if at.pendulum else PlainBarrier(at)
         control = nn.Sequential(mlp((at.size, 48, 48, env.action_dim), nn.SiLU), nn.Tanh())
         groups = [(data.region == code).nonzero()[:, 0] for code in (SAFE, UNSAFE)]
+        outside = (data.region != UNSAFE).nonzero()[:, 0]
         step = c.rate * env.dt  # type: ignore[attr-defined]
 
         def loss(rows: Tensor) -> dict[str, Tensor]:
             terms: dict[str, Tensor] = {}
             for name, group, sign in (("safe", groups[0], 1.0), ("unsafe", groups[1], -1.0)):
                 h = sign * self.net(data.state[group[rows % len(group)]]) if len(group) else torch.zeros(1)
-                terms[f"loss_{name}"] = (c.margin - h).clamp_min(0).mean()
-            x = data.state[rows]
+                terms[f"loss_{name}"] = c.hinge * (c.margin - h).clamp_min(0).mean()
+            x = data.state[outside[rows % len(outside)]]
             share = control(at.features(x))
             after = env.wrap(env.dynamics(x, env.max_action * share))
             here = self.net(x)
             gone = ~env.state_space.contains(after) & (env.exit_region == SAFE)
             missing = (c.slack - self.net(after) + (1 - step) * here).clamp_min(0)
-            terms["loss_kept"] = 10.0 * (missing * ((here > 0) & ~gone)).mean()
+            asked = (here > 0) & ~gone
+            terms["loss_kept"] = 10.0 * (missing * asked).sum() / asked.sum().clamp_min(1)
             terms["loss_effort"] = 0.01 * share.square().mean()
             return terms
 

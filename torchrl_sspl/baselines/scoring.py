@@ -10,20 +10,22 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.baselines.base import Guarded, Nominal, SafetyMethod
+from torchrl_sspl.baselines.data import pooled
+from torchrl_sspl.baselines.pictures import Album, shifts
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.evaluation.known import states_where
 from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
-_ROWS = 500  # pictures at a time
 _RIM = 2  # cells of the kernel's grid that the common set keeps from its border
 _ENTER = 0.001  # share of the check episodes that may enter U at a calibrated level
 NOMINALS = ("harmless", "adversarial")
+CLAIMS = ("claimed_over_kernel", "false_safe", "unsafe_called_safe")
 
 
 @dataclass
@@ -36,6 +38,7 @@ class ScoreConfig:
     kernel_grid: int = 0  # the same of the true kernel's grid
     check_episodes: int = 0  # that place a calibrated level; 0: as many as episodes
     frames: int = 200  # of which the latency is taken
+    shifted: int = 1000  # uniform states that are shown on shifted pictures of each kind; 0: none
     seed: int = 20260104  # of the starts
 
 
@@ -93,8 +96,15 @@ def well_inside(kernel: ViabilityKernel, state: Tensor, cells: int = _RIM) -> Te
     return inside
 
 
-def barrier_on(method: SafetyMethod, env: SafetyEnv, state: Tensor) -> Tensor | None:
+def barrier_on(method: SafetyMethod, env: SafetyEnv, state: Tensor, album: Album | None = None, shift: str = "") -> Tensor | None:
     """Barrier values ``(n,)`` of a method at true states ``(n, s)``, by its pictures if it reads those; None without. Source: none.
+
+    Args:
+        method: fitted.
+        env: the system.
+        state: ``(n, s)``.
+        album: pictures that were drawn before; those of ``env`` if not given.
+        shift: name of other pictures, see ``shifts``.
 
     Example:
         >>> from torchrl_sspl.baselines import make
@@ -102,12 +112,29 @@ def barrier_on(method: SafetyMethod, env: SafetyEnv, state: Tensor) -> Tensor | 
         True
     """
     values = []
-    for part in state.split(len(state) if method.reads == "state" and len(state) else _ROWS):
-        value = method.barrier(part if method.reads == "state" else env.observe(part))
+    for seen in [state] if method.reads == "state" else (album or Album(env))(state, shift, small=method.pools):
+        value = method.barrier(seen)
         if value is None:
             return None
         values.append(value.detach())
     return torch.cat(values) if values else torch.zeros(0)
+
+
+def paths(method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal, horizon: int) -> tuple[Guarded, Tensor]:
+    """What acted from states ``(n, s)``, and ``(n,)`` which of the episodes enter U. Source: none.
+
+    Example:
+        >>> from torchrl_sspl.baselines import BUDGETS, make
+        >>> env, method = PixelPendulumEnv(), make("lqr")
+        >>> method.fit(None, env, BUDGETS["tiny"], 0)
+        >>> paths(method, env, torch.tensor([[0.1, 0.0], [1.5, 1.4]]), harmless(env), 9)[1]
+        tensor([False,  True])
+    """
+    acts = method.controller(nominal)
+    # Each frame is averaged once, not with every observation that holds it.
+    draw = (lambda state: pooled(env.draw(state))) if method.pools else env.draw
+    run = simulate(acts, env, start=start, horizon=horizon, draw=draw)
+    return acts, ((run.region == UNSAFE) & run.alive).any(0)
 
 
 @dataclass
@@ -119,12 +146,17 @@ class _Score:
     kernel: ViabilityKernel
     config: ScoreConfig
     out: Evaluation
+    album: Album
+
+    def barrier(self, state: Tensor, shift: str = "") -> Tensor | None:
+        return barrier_on(self.method, self.env, state, self.album, shift)
+
+    def inside(self, state: Tensor) -> Tensor:
+        value = self.barrier(state)
+        return torch.zeros(len(state), dtype=torch.bool) if value is None else value <= 0
 
     def episodes(self, start: Tensor, nominal: Nominal) -> tuple[Guarded, Tensor]:
-        """What acted, and which of the episodes enter U."""
-        acts = self.method.controller(nominal)
-        run = simulate(acts, self.env, start=start, horizon=self.config.horizon)
-        return acts, ((run.region == UNSAFE) & run.alive).any(0)
+        return paths(self.method, self.env, start, nominal, self.config.horizon)
 
     def starts(self, keep, index: int) -> Tensor:
         generator = torch.Generator().manual_seed(self.config.seed + index)
@@ -133,21 +165,23 @@ class _Score:
 
 @torch.no_grad()
 def score(
-    method: SafetyMethod, env: SafetyEnv, config: ScoreConfig | None = None, *, kernel: ViabilityKernel | None = None
+    method: SafetyMethod, env: SafetyEnv, config: ScoreConfig | None = None, *, kernel: ViabilityKernel | None = None, album: Album | None = None
 ) -> Evaluation:
-    """Measures a method after ``fit``: its claims on a grid, its closed loop, its latency.
+    """Measures a method after ``fit``: its claims on a grid, its closed loop, its latency, its claims on shifted pictures.
 
     The names: ``claimed_over_kernel``, ``false_safe`` (of what is claimed), ``unsafe_called_safe``;
     ``claimed_<nominal>_enter`` and ``common_<nominal>_enter``, episodes into U from the claimed set and from the kernel without
     its rim of two cells; ``<...>_infeasible`` (of all steps) and ``<...>_deviation`` (mean distance from the nominal
     action); ``calibrated_...`` at the level at which at most one in a thousand other episodes enters U; ``latency_p50`` and
-    ``latency_p99``. A method that claims nothing is measured from the common set alone.
+    ``latency_p99``; ``shifted_<name>_...``, the claims of one who reads pictures when these are other ones, see
+    :func:`~torchrl_sspl.baselines.pictures.shifts`. A method that claims nothing is measured from the common set alone.
 
     Args:
         method: fitted.
         env: the true system.
         config: sizes; see :class:`ScoreConfig`.
         kernel: true viability kernel; computed if not given.
+        album: pictures that another score of the same system has drawn.
 
     Returns measurements with exact 95 % bounds. Source: none; the paper compares by ticks.
 
@@ -163,19 +197,21 @@ def score(
     episodes = given.episodes or (10_000 if on_states else 500)
     sizes = ScoreConfig(
         episodes, given.horizon or (200 if on_states else 100), given.grid, given.kernel_grid,
-        given.check_episodes or episodes, given.frames, given.seed,
+        given.check_episodes or episodes, given.frames, given.shifted, given.seed,
     )  # fmt: skip
     for name in ("episodes", "horizon", "frames"):
         if getattr(sizes, name) < 1:
             raise ConfigError(f"score.{name}: expected at least 1, received {getattr(sizes, name)}; 0 in the configuration: the default")
     if kernel is None:
         kernel = viability_kernel(env, resolution=sizes_of(env.system.kernel_grid, given.kernel_grid))
-    it = _Score(method, env, kernel, sizes, Evaluation())
+    it = _Score(method, env, kernel, sizes, Evaluation(), album or Album(env))
     barrier = _sets(it)
     if barrier is not None:
-        _calibrated(it, barrier, _loops(it, "claimed", lambda x: _inside(it, x), 0))
+        _calibrated(it, barrier, _loops(it, "claimed", it.inside, 0))
     _loops(it, "common", lambda x: well_inside(kernel, x), 1)
     _latency(it)
+    if barrier is not None and not on_states and sizes.shifted:
+        _shifted(it)
     return it.out
 
 
@@ -206,18 +242,13 @@ def middles(env: SafetyEnv, sizes: int | tuple[int, ...]) -> Tensor:
     return torch.stack(torch.meshgrid(*axes, indexing="ij"), -1).reshape(-1, len(axes))
 
 
-def _inside(it: _Score, state: Tensor) -> Tensor:
-    value = barrier_on(it.method, it.env, state)
-    return torch.zeros(len(state), dtype=torch.bool) if value is None else value <= 0
-
-
 def _sets(it: _Score) -> tuple[Tensor, Tensor, Tensor] | None:
     """The claimed set on a grid: barrier, kernel, U, one value for each node."""
     states = middles(it.env, sizes_of(it.env.system.state_grid, it.config.grid))
     viable, unsafe = it.kernel.contains(states), it.env.unsafe_set.contains(states)
-    barrier = barrier_on(it.method, it.env, states)
+    barrier = it.barrier(states)
     if barrier is None:
-        it.out.missing("claimed_over_kernel", "false_safe", "unsafe_called_safe", note="claims nothing")
+        it.out.missing(*CLAIMS, note="claims nothing")
         return None
     _count_sets(it.out, "", barrier <= 0, viable, unsafe)
     it.out.arrays.update(states=states, barrier=barrier, viable=viable)
@@ -255,17 +286,17 @@ def _calibrated(it: _Score, sets: tuple[Tensor, Tensor, Tensor], found: list[tup
     if len(found) < 2:
         it.out.missing("calibrated_claimed_over_kernel", "calibrated_false_safe", "calibrated_unsafe_called_safe", *names, note="nothing is claimed")
         return
-    check, n = it.starts(lambda x: _inside(it, x), 2), it.config.check_episodes
+    check, n = it.starts(it.inside, 2), it.config.check_episodes
     half = check[: n // 2], check[n // 2 : n]
     both = [(x, it.episodes(x, make(it.env))[1]) for x, make in zip(half, (harmless, adversarial), strict=True) if len(x)]
-    value = barrier_on(it.method, it.env, torch.cat([x for x, _ in both]))
+    value = it.barrier(torch.cat([x for x, _ in both]))
     assert value is not None
     level = calibrated_level(value, torch.cat([e for _, e in both]))
     it.out.add(Measurement("calibrated_level", level if math.isfinite(level) else None, "barrier", len(value), note="of held-out episodes"))
     barrier, viable, unsafe = sets
     _count_sets(it.out, "calibrated_", barrier <= level, viable, unsafe)
     for name, (start, entered) in zip(names, found, strict=True):
-        of = barrier_on(it.method, it.env, start)
+        of = it.barrier(start)
         assert of is not None
         it.out.count(name, entered & (of <= level), "of the episodes from the claimed set, those that start below the level", of <= level)
 
@@ -307,4 +338,18 @@ def _latency(it: _Score) -> None:
         it.out.add(Measurement(name, value, "ms", len(ordered), note=f"{torch.get_num_threads()} thread(s), action and claim"))
 
 
-__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "middles", "score", "sizes_of", "well_inside"]
+def _shifted(it: _Score) -> None:
+    """What is claimed on pictures of another kind, at states that are the same for all methods."""
+    state = it.env.state_space.sample(it.config.shifted, torch.Generator().manual_seed(it.config.seed + 3))
+    viable, unsafe = it.kernel.contains(state), it.env.unsafe_set.contains(state)
+    for name in shifts(it.env):
+        try:
+            claimed = it.barrier(state, name)
+        except MissingDependencyError as error:
+            it.out.missing(*(f"shifted_{name}_{n}" for n in CLAIMS), note=str(error))
+            continue
+        assert claimed is not None
+        _count_sets(it.out, f"shifted_{name}_", claimed <= 0, viable, unsafe)
+
+
+__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "middles", "paths", "score", "sizes_of", "well_inside"]

@@ -10,7 +10,7 @@ nominal and half of a safety policy.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -40,6 +40,9 @@ class SmoothLatent(LatentSafe):
 
     name = "smooth_latent"
     Config: ClassVar[type | None] = SmoothLatentConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "world_steps": (2000, 6000), "discount": (0.98, 0.995, 0.999), "threshold": (0.0, 0.1, 0.2), "keep": (0.5, 0.8, 0.9, 0.95),
+    }  # fmt: skip
 
     def margin_loss(self, good: Tensor, bad: Tensor) -> dict[str, Tensor]:
         """The formula above."""

@@ -25,6 +25,33 @@ from torchrl_sspl.modules.agent import Agent, agent_directory, load
 from torchrl_sspl.runtime.filter import UNPROVED_MARGIN, Shield
 
 
+def settings(system: str, budget: Budget) -> list[str]:
+    """``key=value`` of a training with the transitions of a budget: the recommended settings of a system, with as many steps.
+
+    Source: none.
+
+    Example:
+        >>> settings("pendulum", Budget("small", 16_000, 3_000, 4_000))[1:5:3]
+        ['collector.starts=[0.3478, 0.3478, 0.1304, 0.1739]', 'trainer.optim_steps_per_batch=4000']
+    """
+    shares = [0.5 * budget.transitions, 0.5 * budget.transitions, budget.safe, budget.unsafe]
+    first, usual = budget.total - budget.rollouts, compose([f"env={system}"])
+    batch, most = usual.collector.frames_per_batch, usual.trainer.total_frames
+    frames = -(-first // batch) * batch
+    plan = [f"env={system}", f"collector.starts={[round(s / sum(shares), 4) for s in shares]}"]
+    if budget.rollouts:
+        return [*plan, f"trainer.total_frames={min(frames, most)}", f"synthesis.transitions={first}"]
+    # As many steps as the recommended settings take, all of them when everything is recorded.
+    learning = -(-most // batch) - -(-usual.random_frames() // batch) + 1
+    steps = usual.trainer.optim_steps_per_batch * learning
+    return [
+        *plan, f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}",
+        f"synthesis.transitions={frames}", "synthesis.rounds=1", "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
+        # A memory, and what is proved of it, are learnt from rollouts.
+        "synthesis.gain=1.0", "synthesis.tolerated_error=0.0", "synthesis.cover_share=0.0",
+    ]  # fmt: skip
+
+
 @dataclass
 class SSPLConfig:
     """Options of this library's own row."""
@@ -37,8 +64,11 @@ class SSPLConfig:
 class SSPL(SafetyMethod):
     """SSPL, this library's own method: from a few labels, without states and model. Source: the paper."""
 
-    name, records = "sspl", False
+    name, records, pools = "sspl", False, False
     Config: ClassVar[type | None] = SSPLConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "overrides": ("[]", "[synthesis.residual_spread=1.0]", "[synthesis.residual_spread=2.0]", "[synthesis.margin=0.03]", "[synthesis.tune_steps=8000]"),
+    }  # fmt: skip
 
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Load the agent, or train one with the budget; see :meth:`SafetyMethod.fit`."""
@@ -67,27 +97,8 @@ class SSPL(SafetyMethod):
     def _train(self, env: SafetyEnv, budget: Budget, seed: int) -> tuple[Agent, dict[str, int]]:
         if self.directory is None:
             raise ConfigError("sspl: expected a directory for the training, received none; run it as a cell")
-        system = "pendulum" if isinstance(env, PixelPendulumEnv) else "dubins"
-        shares = [0.5 * budget.transitions, 0.5 * budget.transitions, budget.safe, budget.unsafe]
-        first = budget.total - budget.rollouts
-        batch = 1280 if system == "pendulum" else 640
-        frames = -(-first // batch) * batch
-        plan = [
-            f"env={system}", f"seed={seed}", f"out_dir={self.directory / 'run'}", "logger=none", "trainer.progress=false",
-            f"collector.starts={[round(s / sum(shares), 4) for s in shares]}", "evaluation.calibrate=true",
-        ]  # fmt: skip
-        if budget.rollouts:
-            plan += [f"trainer.total_frames={min(frames, 24320 if system == 'pendulum' else 9600)}", f"synthesis.transitions={first}"]
-        else:
-            # As many steps as the recommended settings take, over fewer batches.
-            usual = compose([f"env={system}"]).trainer
-            steps = round(usual.optim_steps_per_batch * usual.total_frames / frames)
-            plan += [
-                f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}",
-                f"synthesis.transitions={frames}", "synthesis.rounds=1", "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
-                # A memory, and what is proved of it, are learnt from rollouts.
-                "synthesis.gain=1.0", "synthesis.tolerated_error=0.0", "synthesis.cover_share=0.0",
-            ]  # fmt: skip
+        plan = ["logger=none", "trainer.progress=false", "evaluation.calibrate=true", f"seed={seed}", f"out_dir={self.directory / 'run'}"]
+        plan = [*settings("pendulum" if isinstance(env, PixelPendulumEnv) else "dubins", budget), *plan]
         experiment = Experiment(compose([*plan, *self.config.overrides]))
         agent = experiment.train().cpu()
         self.notes["passed"] = float(any(check.passed for check in experiment.work.checks))

@@ -50,6 +50,7 @@ _MEASURED = (
     ("deviation", "common_harmless_deviation", False, max),
     ("calibrated / kernel", "calibrated_claimed_over_kernel", True, min),
 )
+_SHIFTS = ("renderer", "dark", "bright", "background", "object")
 _NEEDED = (
     ("transitions", "transitions"), ("S", "safe_labels"), ("U", "unsafe_labels"), ("states", "states"), ("masks", "masks"),
     ("expert actions", "expert_actions"), ("state at run time", "state_at_run_time"), ("dynamics", "dynamics"),
@@ -67,19 +68,20 @@ def cells(words: Sequence[str]) -> list[Cell]:
     """
     given = parse(list(words))
     scores = [f"{k}={v}" for k, v in given.items() if k.startswith("score.")]
-    unknown = [k for k in given if k not in ("methods", "env", "budget", "seed") and not k.startswith("score.")]
+    unknown = [k for k in given if k not in ("methods", "env", "budget", "seed", "trials") and not k.startswith("score.")]
     if unknown:
-        raise ConfigError(f"table: expected methods=, env=, budget=, seed= and score.*=, received {', '.join(unknown)}")
+        raise ConfigError(f"table: expected methods=, env=, budget=, seed=, trials= and score.*=, received {', '.join(unknown)}")
     found: dict[Path, Cell] = {}
     for env in given.get("env", "pendulum,dubins").split(","):
         if env not in DEFAULTS and "methods" not in given:
             raise ConfigError(f"table: expected env among {', '.join(DEFAULTS)}, or methods= with it, received '{env}'")
         names = _names(given["methods"]) if "methods" in given else DEFAULTS[env]
-        for name, budget, seed in itertools.product(names, given.get("budget", "small").split(","), given.get("seed", "0").split(",")):
+        # Those of one recording one after the other: it is made once.
+        for budget, seed, name in itertools.product(given.get("budget", "small").split(","), given.get("seed", "0").split(","), names):
             method, *options = name.split(":")
             if not kind_of(method).learns or any(o.startswith("agent=") for o in options):
                 seed = "0"
-            cell = Cell.of(method, [f"env={env}", f"budget={budget}", f"seed={seed}", *options, *scores])
+            cell = Cell.of(method, [f"env={env}", f"budget={budget}", f"seed={seed}", f"trials={given.get('trials', '0')}", *options, *scores])
             found[cell.directory] = cell
     return list(found.values())
 
@@ -115,18 +117,20 @@ def table(words: Sequence[str]) -> str:
 
 
 def markdown(rows: Sequence[tuple[Cell, dict[str, Any] | str]]) -> str:
-    """Two tables for each system: what was measured, and what each method was given. Source: none."""
+    """Three tables for each system: what was measured, on shifted pictures too, and what each method was given. Source: none."""
     text = []
     for env, group in itertools.groupby(sorted(rows, key=lambda r: r[0].env), key=lambda r: r[0].env):
         several: dict[tuple[str, str], list[dict[str, Any] | str]] = {}
         for cell, row in group:
-            label = " ".join([cell.method, *cell.options])
+            label = " ".join([cell.method, *cell.options, *([f"trials={cell.trials}"] if cell.trials else [])])
             trained = any(option.startswith("agent=") for option in cell.options)
             several.setdefault((label, "its own" if trained else cell.budget), []).append(row)
         head = ["method", "budget", *(c[0] for c in _MEASURED), "latency p50 / p99", "episodes"]
         lines = [_line(head), _line(["---"] * len(head))]
         needs = ["method", "budget", *(c[0] for c in _NEEDED), "training, CPU min", "proved", "paper: " + ", ".join(_TICK_NAMES)]
         given = [_line(needs), _line(["---"] * len(needs))]
+        moved = ["method", "budget", *_SHIFTS]
+        shifted = [_line(moved), _line(["---"] * len(moved))]
         for (label, budget), found in several.items():
             good = [row for row in found if isinstance(row, dict)]
             if not good:
@@ -135,12 +139,22 @@ def markdown(rows: Sequence[tuple[Cell, dict[str, Any] | str]]) -> str:
             first = good[0]
             episodes = str(first["measurements"].get("common_harmless_enter", {}).get("n"))
             lines.append(_line([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes]))
+            if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
+                shifted.append(_line([label, budget, *(" / ".join(_value(good, _moved(c, shift)) for c in _MEASURED[:3]) for shift in _SHIFTS)]))
             facts = [str(first["needs"][key]) for _, key in _NEEDED]
             minutes = sum(row["minutes"]["fit_cpu"] for row in good) / len(good)
             ticks = TICKS.get(first["cell"]["method"], "")
             given.append(_line([label, budget, *facts, f"{minutes:.1f}", first["needs"]["proved"], " ".join("✓" if t == "+" else "✗" for t in ticks) or "-"]))
         text += [f"### {env}", "", *lines, "", *given, ""]
+        if len(shifted) > 2:
+            text += ["Shifted pictures: claimed / kernel, false-safe, U called safe", "", *shifted, ""]
     return "\n".join(text)
+
+
+def _moved(column: tuple[str, str, bool, Any], shift: str) -> tuple[str, str, bool, Any]:
+    """The column of a measurement on shifted pictures."""
+    head, name, share, worst = column
+    return head, f"shifted_{shift}_{name}", share, worst
 
 
 def _line(cells_of_row: Sequence[str]) -> str:

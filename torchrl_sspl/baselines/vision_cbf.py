@@ -131,6 +131,7 @@ class VisionCBFConfig:
     plain: float = 100.0  # weight of the plain loss beside it
     k: float = 1.0  # of the pendulum's higher-order barrier, 1/s
     alpha: float = 0.5  # share of h that a step may leave
+    offset: float = 0.0  # added to h
 
 
 class VisionCBF(OneStepFilter):
@@ -144,11 +145,14 @@ class VisionCBF(OneStepFilter):
 
     name = "vision_cbf"
     Config: ClassVar[type | None] = VisionCBFConfig
+    space: ClassVar[dict[str, tuple[Any, ...]]] = {
+        "steps": (1500, 4500), "k": (0.5, 1.0, 2.0), "alpha": (0.5, 0.8, 0.95), "offset": (0.0, 0.1, 0.3),
+    }  # fmt: skip
 
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Learn to draw the geometry; see :meth:`SafetyMethod.fit`."""
         c = self.config
-        self.env, self.alpha, self.of = env, c.alpha, Geometry(env)
+        self.env, self.alpha, self.offset, self.of = env, c.alpha, c.offset, Geometry(env)
         self.network, judge = UNet(self.of.channels), nn.Sequential(
             nn.Conv2d(6 + self.of.channels, 16, 4, 2, 1), nn.LeakyReLU(0.2), nn.Conv2d(16, 32, 4, 2, 1), nn.LeakyReLU(0.2), nn.Conv2d(32, 1, 3, 1, 1)
         )  # fmt: skip

@@ -7,6 +7,7 @@ from torchrl_sspl.configs.schema import (
     CollectorConfig,
     Config,
     EvaluationConfig,
+    LabelsConfig,
     LoggerConfig,
     LossConfig,
     NetworkConfig,
@@ -16,6 +17,6 @@ from torchrl_sspl.configs.schema import (
 )
 
 __all__ = [
-    "AugmentationConfig", "BufferConfig", "CollectorConfig", "Config", "EnvFactory", "EvaluationConfig", "LoggerConfig", "LossConfig",
+    "AugmentationConfig", "BufferConfig", "CollectorConfig", "Config", "EnvFactory", "EvaluationConfig", "LabelsConfig", "LoggerConfig", "LossConfig",
     "NetworkConfig", "OptimConfig", "SynthesisConfig", "TrainerConfig", "compose", "load", "save",
 ]  # fmt: skip

@@ -121,6 +121,15 @@ class AugmentationConfig:
 
 
 @dataclass
+class LabelsConfig:
+    """Which of the labels that the environment gives are used in the training, those that come first; held-out checks have their own."""
+
+    safe: int | None = _option(None, "labels of S at most, everything else is unlabelled; null: all.")
+    unsafe: int | None = _option(None, "the same of U.")
+    wrong: float = _option(0.0, "chance that a label is the other one.")
+
+
+@dataclass
 class OptimConfig:
     """The optimiser of the joint training (Adam)."""
 
@@ -274,6 +283,7 @@ class Config:
     collector: CollectorConfig = _option(CollectorConfig, "where transitions come from.")
     buffer: BufferConfig = _option(BufferConfig, "store of transitions.")
     augmentation: AugmentationConfig = _option(AugmentationConfig, "changes of the pictures.")
+    labels: LabelsConfig = _option(LabelsConfig, "few labels, and wrong ones.")
     optim: OptimConfig = _option(OptimConfig, "optimiser of the joint training.")
     trainer: TrainerConfig = _option(TrainerConfig, "joint training.")
     synthesis: SynthesisConfig = _option(SynthesisConfig, "phases on frozen latents.")
@@ -334,6 +344,6 @@ class Config:
 
 
 __all__ = [
-    "AugmentationConfig", "BufferConfig", "CollectorConfig", "Config", "EvaluationConfig", "LoggerConfig", "LossConfig", "NetworkConfig",
+    "AugmentationConfig", "BufferConfig", "CollectorConfig", "Config", "EvaluationConfig", "LabelsConfig", "LoggerConfig", "LossConfig", "NetworkConfig",
     "OptimConfig", "PRESETS", "SynthesisConfig", "TrainerConfig",
 ]

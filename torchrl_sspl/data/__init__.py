@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.data.collect import RandomActions, collect_random, collect_rollouts
+from torchrl_sspl.data.labels import Labels
 from torchrl_sspl.data.store import RegionSampler, TransitionStore
 
-__all__ = ["Augmentation", "RandomActions", "RegionSampler", "TransitionStore", "collect_random", "collect_rollouts"]
+__all__ = ["Augmentation", "Labels", "RandomActions", "RegionSampler", "TransitionStore", "collect_random", "collect_rollouts"]

@@ -14,6 +14,7 @@ from torchrl.data.replay_buffers import RoundRobinWriter, Sampler, Storage, Tens
 
 from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.data.frames import FrameBank
+from torchrl_sspl.data.labels import Labels
 from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, EmptyRegionError, ShapeError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
@@ -44,6 +45,7 @@ class TransitionStore(Storage):
         pixel_views: hand out the observations beside the frames.
         keep_state: keep the true states, for evaluation.
         augmentation: changes frames before they are stored; transitions that follow each other share a camera.
+        labels: which labels are stored: at most so many in the store, and then none of ``("next", "region")``.
 
     Raises ConfigError if ``capacity`` is not a positive integer. Source: the data sets D, S, U of the paper (Section
     IV): S and U are the labelled part of D, not copies.
@@ -62,12 +64,13 @@ class TransitionStore(Storage):
     """
 
     def __init__(
-        self, capacity: int, *, pixel_views: bool = False, keep_state: bool = False, augmentation: Augmentation | None = None
-    ) -> None:
+        self, capacity: int, *, pixel_views: bool = False, keep_state: bool = False, augmentation: Augmentation | None = None,
+        labels: Labels | None = None,
+    ) -> None:  # fmt: skip
         if not isinstance(capacity, int) or capacity < 1:
             raise ConfigError(f"capacity: expected an integer >= 1, received {capacity!r}.")
         super().__init__(capacity)
-        self.pixel_views, self.keep_state, self.augmentation = pixel_views, keep_state, augmentation
+        self.pixel_views, self.keep_state, self.augmentation, self.labels = pixel_views, keep_state, augmentation, labels
         self.device = torch.device("cpu")
         self._len = self._cursor = 0
         self._bank = FrameBank(1)
@@ -130,6 +133,11 @@ class TransitionStore(Storage):
             return
         now, then = _observations(data)
         columns = self._rows(data)
+        if self.labels is not None:
+            stays = torch.ones(self._len, dtype=torch.bool)
+            stays[index[index < self._len]] = False
+            columns["region"] = self.labels(columns["region"], self.region[stays], int(index[0]))
+            columns["next_region"] = torch.zeros_like(columns["next_region"])
         if set_cursor:
             self._set_last_cursor(index)
             self._cursor = int(index[-1] + 1) % self.max_size

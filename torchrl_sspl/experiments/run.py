@@ -24,8 +24,8 @@ from tqdm import tqdm
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
-from torchrl_sspl.configs.schema import Config
-from torchrl_sspl.data import Augmentation, TransitionStore
+from torchrl_sspl.configs.schema import Config, LabelsConfig
+from torchrl_sspl.data import Augmentation, Labels, TransitionStore
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions, make_collector
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import SafetyEnv
@@ -129,8 +129,9 @@ class Experiment:
         self.logger = make_logger(config.logger.kind, config.logger.kind, self.directory, project=config.logger.project)
         # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
         self.augmentation = Augmentation(**vars(config.augmentation), seed=config.seed) if config.augmentation.share else None
+        self.labels = Labels(**vars(config.labels), seed=config.seed) if config.labels != LabelsConfig() else None
         self.store = TransitionStore(
-            config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=self.augmentation
+            config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=self.augmentation, labels=self.labels
         )
         self.work = self._workspace()
         self.phases = Phases(agent_phases(config, known=self.known), self.work)
@@ -198,7 +199,7 @@ class Experiment:
         source = Source(
             self.make_env, self.encoder, store=self.store, starts=c.starts,
             steps=self.config.synthesis.episode_steps or c.max_frames_per_traj,
-            envs=256 if self.known else c.envs, seed=seed, augmentation=self.augmentation,
+            envs=256 if self.known else c.envs, seed=seed, augmentation=self.augmentation, labels=self.labels,
         )  # fmt: skip
         body = self.config.to_dict()
         body.pop("out_dir")

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictSequential
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from torchrl_sspl.data import Augmentation, TransitionStore, collect_random, collect_rollouts
+from torchrl_sspl.data import Augmentation, Labels, TransitionStore, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.data.store import continues
 from torchrl_sspl.direction import direction_of
@@ -63,6 +63,7 @@ class Source:
         envs: environments stepped together.
         seed: seed of all collections.
         augmentation: changes the pictures of what is collected anew; the store's are as they are.
+        labels: how many labels there are in all; what is collected anew gets those that the store has left.
 
     Source: paper Algorithm 1 (D grows by rollouts of the policy); deviation: labels of the rollouts are used too.
     """
@@ -78,8 +79,9 @@ class Source:
         envs: int = 256,
         seed: int = 0,
         augmentation: Augmentation | None = None,
+        labels: Labels | None = None,
     ) -> None:
-        self.make_env, self.encoder, self.store = make_env, getattr(encoder, "module", encoder), store
+        self.make_env, self.encoder, self.store, self.labels = make_env, getattr(encoder, "module", encoder), store, labels
         self.starts, self.steps, self.envs, self.seed, self.augmentation = list(starts), steps, envs, seed, augmentation
         self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
 
@@ -183,7 +185,10 @@ class Source:
         for k, size in enumerate(c.numel() for c in torch.arange(n).split(_CHUNK)):
             seed = spawn(self.seed, "rounds", 1000 * index + k)
             changes = None if self.augmentation is None else self.augmentation.with_seed(seed)
-            store = TransitionStore(size, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=changes)
+            labels = None
+            if self.labels is not None:
+                labels = self.labels.less(self.budget["labels of S"], self.budget["labels of U"], seed=seed)
+            store = TransitionStore(size, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=changes, labels=labels)
             draw(env, store, seed)
             self.count(store)
             parts.append(self._encode(store, torch.arange(len(store))))

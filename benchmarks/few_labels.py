@@ -1,0 +1,111 @@
+"""Few labels: how large and how wrong the set is over the number of labelled pictures, of unlabelled transitions, of wrong labels.
+
+Run: python benchmarks/few_labels.py [env=pendulum] [labels=100,300,1000,all] [transitions=20000] [wrong=0,0.01,0.05] [seed=0,1,2] [out=runs/few_labels]
+     [run=false] [score.KEY=VALUE ...] [KEY=VALUE of the training ...]
+
+Every point is a training of its own, with the recommended settings, one round and no rollouts; a point that has been measured is read.
+Of ``transitions``, recorded under random actions with 15 % of the episodes starting in S and 25 % in U, at most ``labels`` of each
+kind are labelled, those that come first; the rest is unlabelled. The level of the set is placed by held-out episodes with labels of their
+own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``.
+"""
+
+from __future__ import annotations
+
+import itertools
+import json
+import sys
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from torchrl_sspl.baselines import Budget, ScoreConfig, make, score
+from torchrl_sspl.baselines.cell import Cell
+from torchrl_sspl.configs.reader import parse
+from torchrl_sspl.files import RunDirectory, write
+
+LISTS = {"labels": "100,300,1000,all", "transitions": "20000", "wrong": "0", "seed": "0,1,2"}
+SHARES = (0.6, 0.15, 0.25)  # of the episodes: anywhere or outside U, in S, in U
+COLUMNS = (
+    ("volume / kernel", "claimed_over_kernel"), ("false-safe", "false_safe"), ("U called safe", "unsafe_called_safe"),
+    ("claimed, enter U", "claimed_harmless_enter"), ("common, enter U", "common_harmless_enter"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Point:
+    """What determines one training."""
+
+    env: str
+    labels: str  # of each kind at most, or "all"
+    transitions: int
+    wrong: float
+    seed: int
+    options: tuple[str, ...]
+
+    @property
+    def path(self) -> Path:
+        """File of the point, below the directory of all."""
+        name = f"{self.labels}-labels-{self.transitions}-transitions-{self.wrong}-wrong"
+        if self.options:
+            name += f"-{sha256(' '.join(self.options).encode()).hexdigest()[:8]}"
+        return Path(self.env) / name / str(self.seed) / "point.json"
+
+    def measure(self, path: Path, sizes: ScoreConfig) -> dict[str, Any]:
+        """Train and score, or read what has been measured."""
+        with RunDirectory(path.parent).held() as directory:
+            if path.is_file():
+                return json.loads(path.read_text())
+            few = [] if self.labels == "all" else [f"labels.safe={self.labels}", f"labels.unsafe={self.labels}"]
+            method = make("sspl", [f"overrides={json.dumps([f'labels.wrong={self.wrong}', *few, *self.options])}"])
+            method.directory, env = directory, Cell("kernel", self.env, seed=self.seed).environment()
+            method.fit(None, env, Budget("few", *(round(share * self.transitions) for share in SHARES)), self.seed)
+            found = score(method, env, sizes)
+            row = asdict(self) | {"passed": method.notes["passed"], "needs": asdict(method.needs), "measurements": found.to_dict()}
+            write(path, json.dumps(row, indent=1) + "\n")
+            return row
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """One line for each point: means over the seeds, worst in brackets."""
+    head = ["env", "labels of S", "labels of U", "transitions", "wrong", "seeds", "passed the checks", *(c for c, _ in COLUMNS)]
+    lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
+
+    def of(row: dict[str, Any]) -> tuple[Any, ...]:
+        return row["env"], row["labels"], row["transitions"], row["wrong"], tuple(row["options"])
+
+    for _, several in itertools.groupby(rows, key=of):
+        found = list(several)
+        first, cells = found[0], []
+        for _, name in COLUMNS:
+            values = [v for r in found if (v := r["measurements"][name]["value"]) is not None]
+            worst = (min if name == "claimed_over_kernel" else max)(values, default=0.0)
+            mean = f"{100 * sum(values) / len(values):.1f} %" if values else "-"
+            cells.append(mean if len(values) < 2 else f"{mean} ({100 * worst:.1f} %)")
+        needs = [str(first["needs"][k]) for k in ("safe_labels", "unsafe_labels", "transitions")]
+        seeds, passed = ", ".join(str(r["seed"]) for r in found), f"{sum(r['passed'] for r in found):.0f} of {len(found)}"
+        lines.append(f"| {' | '.join([first['env'], *needs, str(first['wrong']), seeds, passed, *cells])} |")
+    return "\n".join(lines)
+
+
+def main(words: list[str]) -> None:
+    """Train what is missing, print the table, write the JSON."""
+    torch.set_num_threads(1)
+    given = parse(words)
+    lists = [given.pop(name, usual).split(",") for name, usual in LISTS.items()]
+    env, out, run = given.pop("env", "pendulum"), Path(given.pop("out", "runs/few_labels")), given.pop("run", "true") == "true"
+    sizes = Cell.of("kernel", [f"{k}={given.pop(k)}" for k in [*given] if k.startswith("score.")]).score
+    more, rows = tuple(f"{k}={v}" for k, v in given.items()), []
+    for labels, transitions, wrong, seed in itertools.product(*lists):
+        one = Point(env, labels, int(transitions), float(wrong), int(seed), more)
+        if run or (out / one.path).is_file():
+            rows.append(one.measure(out / one.path, sizes))
+            print(table(rows[-1:]), file=sys.stderr, flush=True)
+    print(table(rows))
+    write(out / "points.json", json.dumps(rows, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

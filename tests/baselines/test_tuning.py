@@ -1,0 +1,90 @@
+"""Trials: what is drawn, what a method is worth, that the choice is made once and recorded."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+import torch
+
+from torchrl_sspl.baselines import BUDGETS, make
+from torchrl_sspl.baselines.cell import TRIALS_FILE, Cell, run_cell
+from torchrl_sspl.baselines.registry import METHODS, kind_of
+from torchrl_sspl.baselines.tuning import SEED, draws, merit, search
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import ConfigError
+
+SMALL = ["budget=tiny", "score.episodes=6", "score.horizon=4", "score.grid=11", "score.kernel_grid=31", "score.frames=1", "score.shifted=0"]
+
+
+@pytest.mark.parametrize("name", [n for n in METHODS if kind_of(n).learns])
+def test_every_method_that_learns_has_as_many_valid_trials(name):
+    found = draws(name, 4)
+    assert found[0] == ()  # the defaults
+    assert len(set(found)) == 4
+    for words in found:
+        make(name, words)
+    assert draws(name, 4) == found
+    assert draws(name, 4, seed=1) != found or len(kind_of(name).space) == 1
+
+
+def test_a_claim_that_is_not_kept_is_worth_less_than_none():
+    env = PendulumEnv()
+
+    class Claims(type(make("lqr"))):
+        share = 1.0
+
+        def h(self, state):
+            return torch.where(state[:, 0].abs() < self.share, -1.0, 1.0)
+
+        def act(self, seen, nominal):
+            return torch.zeros_like(nominal), torch.zeros(len(seen), dtype=torch.bool)
+
+    method = Claims()
+    method.fit(None, env, BUDGETS["tiny"], 0)
+    assert merit(method, env, states=40, horizon=40) < -1.0  # it falls from nearly everywhere
+    method.share = -1.0
+    assert merit(method, env, states=40, horizon=40) == 0.0
+    lqr = make("lqr")
+    lqr.fit(None, env, BUDGETS["tiny"], 0)
+    # An ellipsoid of 23 % of the kernel, which is 18 % of a state space of which 73 % are U.
+    assert merit(lqr, env, states=400, horizon=40) == pytest.approx(0.23 * 0.18 / 0.214, abs=0.06)
+
+
+def test_the_offset_shrinks_claim_and_filter_alike():
+    env = PendulumEnv()
+    plain, less = make("hocbf"), make("hocbf")
+    for method in (plain, less):
+        method.fit(None, env, BUDGETS["tiny"], 0)
+    less.offset = 0.5
+    state = env.state_space.sample(200, torch.Generator().manual_seed(0))
+    assert torch.allclose(less.barrier(state), plain.barrier(state) + 0.5)
+    tried = plain.candidates(torch.zeros(200, 1))
+    assert torch.allclose(less.after(state, tried), plain.after(state, tried) + 0.5)
+    assert torch.allclose(less.limit(state), plain.limit(state) + less.alpha * 0.5)
+
+
+def test_the_first_of_the_best_is_chosen():
+    options = [(), ("a=1",), ("a=2",)]
+    assert search(lambda words: 0.0, options)[0] == ()
+    assert search(lambda words: -1.0 if not words else 2.0, options)[0] == ("a=1",)
+
+
+def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(kind_of("imitation"), "space", {"steps": (3, 5)})
+    words = ["steps=2", "trials=3", *SMALL]
+    first = run_cell(Cell.of("imitation", ["seed=0", *words]))
+    assert first["cell"]["trials"] == 3
+    assert len(first["tuning"]["trials"]) == 3
+    assert first["tuning"]["chosen"] in [t["options"] for t in first["tuning"]["trials"]]
+    path = tmp_path / "runs/baselines/pendulum/tiny/imitation-steps-2-trials-3" / TRIALS_FILE
+    told = json.loads(path.read_text())
+    told["chosen"] = ["steps=5"]
+    path.write_text(json.dumps(told))
+    assert run_cell(Cell.of("imitation", ["seed=1", *words]))["tuning"]["chosen"] == ["steps=5"]
+    assert "tuning" not in run_cell(Cell.of("imitation", ["steps=2", *SMALL]))
+    assert Cell.of("lqr", ["trials=8"]).trials == 0
+    assert SEED not in (0, 1, 2)
+    with pytest.raises(ConfigError, match="expected trials to be an integer"):
+        Cell.of("imitation", ["trials=few"])

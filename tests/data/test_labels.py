@@ -1,0 +1,115 @@
+"""Few labels, and wrong ones: what is kept, where, and that a run uses no more."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from tensordict import TensorDict
+
+from torchrl_sspl.configs import compose
+from torchrl_sspl.data import Labels, TransitionStore, collect_random
+from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.experiments import Experiment
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+from torchrl_sspl.trainers.source import Source
+
+
+def codes(*values: int) -> torch.Tensor:
+    return torch.tensor(values)[:, None]
+
+
+def rows(region: torch.Tensor) -> TensorDict:
+    pixels = torch.randint(255, (len(region), 6, 4, 4), dtype=torch.uint8)
+    following = torch.cat([pixels[:, 3:], pixels[:, 3:]], 1)
+    body = {"pixels": pixels, "action": torch.zeros(len(region), 1), "region": region, "next": {"pixels": following, "region": region}}
+    return TensorDict(body, [len(region)])
+
+
+def test_the_first_labels_of_each_kind_are_kept():
+    region = codes(1, 2, 1, 0, 2, 2, 1)
+    assert Labels(safe=2, unsafe=1)(region).flatten().tolist() == [1, 2, 1, 0, 0, 0, 0]
+    assert Labels(safe=1)(region).flatten().tolist() == [1, 2, 0, 0, 2, 2, 0]
+    assert Labels(safe=2)(region, torch.tensor([1, 1, 2])).flatten().tolist() == [0, 2, 0, 0, 2, 2, 0]
+    assert torch.equal(Labels()(region), region)
+
+
+def test_wrong_labels_are_the_other_ones_as_often_as_said():
+    region = torch.cat([codes(SAFE).repeat(5000, 1), codes(UNSAFE).repeat(5000, 1), codes(UNLABELLED).repeat(100, 1)])
+    found = Labels(wrong=0.05, seed=3)(region)
+    assert (found[10000:] == UNLABELLED).all()
+    for part, code in ((found[:5000], UNSAFE), (found[5000:10000], SAFE)):
+        assert float((part == code).float().mean()) == pytest.approx(0.05, abs=0.012)
+    assert torch.equal(Labels(wrong=0.05, seed=3)(region), found)
+    assert not torch.equal(Labels(wrong=0.05, seed=3)(region, position=1), found)
+    assert (Labels(wrong=1.0)(region)[:5000] == UNSAFE).all()
+
+
+def test_what_has_been_used_is_not_used_again():
+    left = Labels(safe=5, unsafe=None).less(3, 9, seed=1)
+    assert left.most == {SAFE: 2, UNSAFE: None}
+    assert Labels(safe=5).less(7, 0, seed=1).most[SAFE] == 0
+
+
+def test_a_store_holds_no_more_labels_than_it_may():
+    store = TransitionStore(20, labels=Labels(safe=3, unsafe=2))
+    for _ in range(4):
+        store.extend(rows(codes(1, 2, 0, 1, 2)))
+        assert int((store.region == SAFE).sum()) <= 3
+        assert int((store.region == UNSAFE).sum()) <= 2
+    assert (store.region == SAFE).sum() == 3
+    assert store.get(slice(None))["next", "region"].abs().sum() == 0
+    store.extend(rows(codes(1, 1, 1, 1, 1)))  # in the place of the two labels of S that came first
+    assert (store.region == SAFE).sum() == 3
+    plain = TransitionStore(20)
+    plain.extend(rows(codes(1, 2, 0)))
+    assert plain.get(slice(None))["next", "region"].flatten().tolist() == [1, 2, 0]
+
+
+def test_what_is_collected_later_gets_what_is_left():
+    env = PendulumEnv([16], seed=0)
+    store = TransitionStore(64, labels=Labels(safe=3, unsafe=30))
+    collect_random(env, 64, seed=0, steps=1, store=store)
+    used = int((store.region == UNSAFE).sum())
+    assert 20 < used <= 30
+
+    source = Source(PendulumEnv, _Mean(), store=store, labels=Labels(safe=3, unsafe=30), steps=1)
+    source.count(store)
+    found = source.random(300, 0)["region"]
+    assert int((found == UNSAFE).sum()) == 30 - used
+    assert source.budget["labels of U"] == 30
+    assert source.budget["transitions"] == 364
+
+
+class _Mean(torch.nn.Module):
+    """Brightness of two frames."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.ones(1))
+
+    def sequence(self, frames):
+        mean = frames.float().mean((-1, -2, -3))
+        return torch.stack([mean[:, :2], mean[:, 1:]], 1)
+
+
+def test_a_run_uses_no_more_labels_than_it_may(tmp_path):
+    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false"]
+    run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11"]))
+    run.train()
+    budget = run.work.source.budget
+    assert budget["transitions"] > 100
+    assert budget["labels of S"] == 9
+    assert budget["labels of U"] == 11
+    assert Experiment(compose([*words[:3], f"out_dir={tmp_path}/plain"])).labels is None
+
+
+@pytest.mark.parametrize("options", [{"safe": -1}, {"wrong": 1.5}])
+def test_labels_that_cannot_be_are_refused(options):
+    with pytest.raises(ConfigError, match="labels: expected"):
+        Labels(**options)
+
+
+def test_labels_of_another_shape_are_refused():
+    with pytest.raises(ShapeError, match=r"labels: expected \(n, 1\)"):
+        Labels()(torch.zeros(3, dtype=torch.int64))

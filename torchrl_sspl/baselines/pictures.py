@@ -1,0 +1,138 @@
+"""Pictures that methods are asked about: drawn once for all of them, and as another camera would show them."""
+
+from __future__ import annotations
+
+import functools
+from collections import OrderedDict
+from collections.abc import Callable
+from hashlib import sha256
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.baselines.data import pooled
+from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.dubins import DubinsEnv
+from torchrl_sspl.envs.pendulum import PixelPendulumEnv
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.evaluation.measurements import Draw
+from torchrl_sspl.runtime.faults import CameraFault
+
+_WHITE, _CYAN, _MAGENTA, _BLUE = (255, 255, 255), (0, 255, 255), (255, 0, 255), (77, 77, 204)
+_ROD, _OBSTACLE = (204, 77, 77), (216, 38, 38)
+#: Half a rod before white is half white: the largest difference of their colours.
+_BLEND = 178
+_NEAR = 60  # of the obstacle's colour; whatever is on the robot is farther
+_ROWS = 500  # pictures at a time
+
+
+def recoloured(frames: Tensor, old: tuple[int, int, int], new: tuple[int, int, int], reach: float) -> Tensor:
+    r"""Frames uint8 ``(n, 3, H, W)`` in which one colour is another one, and what is mixed with it as much as it is mixed.
+
+    .. math:: x' = x + w\,(c_{new} - c_{old}), \qquad w = [1 - \max_k |x_k - c_{old,k}| / r]_+
+
+    with the reach r in grey levels. Source: none.
+
+    Example:
+        >>> recoloured(torch.full((1, 3, 1, 1), 255, dtype=torch.uint8), (255, 255, 255), (0, 255, 255), 100).flatten().tolist()
+        [0, 255, 255]
+    """
+    a, b = (torch.tensor(c, dtype=torch.float32)[:, None, None] for c in (old, new))
+    parts = []
+    for part in frames.split(64):
+        x = part.float()
+        weight = (1 - (x - a).abs().amax(1, keepdim=True) / reach).clamp_min(0)
+        parts.append((x + weight * (b - a)).round().clamp(0, 255).to(torch.uint8))
+    return torch.cat(parts)
+
+
+def shifts(env: SafetyEnv) -> dict[str, Draw]:
+    """Other pictures of a system by name, states ``(n, s)`` -> frames uint8 ``(n, 3, H, W)``.
+
+    ``renderer``: gymnasium's own of the pendulum, PyBullet's of the car; ``dark`` and ``bright``: a camera of 0.85 and 1.15 times
+    the brightness; ``background``: cyan in place of white; ``object``: the rod blue, the obstacle magenta. Raises ConfigError for
+    another system. Source: none; colours as in LatentSafe's own shifts.
+
+    Example:
+        >>> sorted(shifts(PixelPendulumEnv()))
+        ['background', 'bright', 'dark', 'object', 'renderer']
+    """
+    if isinstance(env, PixelPendulumEnv):
+        other, old, new, reach = env.renderers()["gymnasium"], _ROD, _BLUE, _BLEND
+    elif isinstance(env, DubinsEnv) and env.obstacle_shape == "square" and env.yaw_lag is None:
+        other, old, new, reach = functools.partial(_bullet, env), _OBSTACLE, _MAGENTA, _NEAR
+    else:
+        raise ConfigError(f"shifted pictures: expected a pendulum or a Dubins car with a square obstacle, received {type(env).__name__}")
+
+    def faulty(name: str, strength: float) -> Draw:
+        def draw(state: Tensor) -> Tensor:
+            frame = env.draw(state)
+            return CameraFault(name, strength, onset=0)(torch.cat([frame, frame], 1), 0)[:, 3:]
+
+        return draw
+
+    return {
+        "renderer": other, "dark": faulty("dark", 0.85), "bright": faulty("bright", 1.15),
+        "background": lambda state: recoloured(env.draw(state), _WHITE, _CYAN, _BLEND),
+        "object": lambda state: recoloured(env.draw(state), old, new, reach),
+    }  # fmt: skip
+
+
+def _bullet(env: Any, state: Tensor) -> Tensor:
+    return _bullet_renderer(env.image_size)(state[:, :3], env.gait_phase(state))
+
+
+@functools.lru_cache(maxsize=2)
+def _bullet_renderer(size: int) -> Callable[[Tensor, Tensor], Tensor]:
+    """One world of PyBullet, made when it is first asked for; it takes the system's default sizes."""
+    from torchrl_sspl.envs.quadruped.sprites import BulletRenderer
+
+    return BulletRenderer(size)
+
+
+class Album:
+    """Observations of a system, two frames each, that several methods are asked about: kept when they have been drawn.
+
+    Args:
+        env: the system.
+        limit: bytes of pictures that are kept; what is larger, or has not been asked for the longest time, is drawn again.
+
+    Example:
+        >>> album, state = Album(PixelPendulumEnv()), torch.zeros(3, 2)
+        >>> [part.shape for part in album(state)], album.drawn
+        ([torch.Size([3, 6, 32, 32])], 3)
+        >>> [len(part) for part in album(state)], album.drawn
+        ([3], 3)
+    """
+
+    def __init__(self, env: SafetyEnv, limit: int = 512 << 20) -> None:
+        self.env, self.limit, self.drawn = env, limit, 0
+        self._kept: OrderedDict[tuple[str, bool, bytes], list[Tensor]] = OrderedDict()
+
+    def __call__(self, state: Tensor, shift: str = "", *, small: bool = True) -> Any:
+        """Observations uint8 ``(k, 6, H, W)`` of states ``(n, s)``, some at a time; ``small``: averaged as methods are given them."""
+        key = (shift, small, sha256(state.contiguous().numpy().tobytes()).digest())
+        if key in self._kept:
+            self._kept.move_to_end(key)
+            yield from self._kept[key]
+            return
+        kept, size = [], 0
+        for part in state.split(_ROWS):
+            seen = self._draw(part, shift, small)
+            size += seen.nbytes
+            kept = [*kept, seen] if size <= self.limit else []
+            yield seen
+        if size <= self.limit:
+            self._kept[key] = kept
+            while sum(t.nbytes for parts in self._kept.values() for t in parts) > self.limit:
+                self._kept.popitem(last=False)
+
+    def _draw(self, state: Tensor, shift: str, small: bool) -> Tensor:
+        draw = shifts(self.env)[shift] if shift else self.env.draw
+        self.drawn += len(state)
+        frames = [draw(x) for x in (self.env.previous_state(state), state)]
+        return torch.cat([pooled(f) for f in frames] if small else frames, 1)
+
+
+__all__ = ["Album", "recoloured", "shifts"]

@@ -1,0 +1,85 @@
+"""Trials: the same number of random draws from a small space for every method, judged on data that no score sees."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+
+from torchrl_sspl.baselines.base import SafetyMethod
+from torchrl_sspl.baselines.registry import kind_of
+from torchrl_sspl.baselines.scoring import NOMINALS, adversarial, barrier_on, harmless, paths
+from torchrl_sspl.envs.base import SafetyEnv
+
+SEED = 100  # of recording, weights and starts of the trials; scored seeds are others
+LOST = 10.0  # an episode from the claimed set that enters U costs as much as so many that do not are worth
+
+
+def draws(method: str, trials: int, seed: int = SEED) -> list[tuple[str, ...]]:
+    """``key=value`` options of each trial: the defaults first, then random draws from the method's ``space``, none twice.
+
+    Source: none.
+
+    Example:
+        >>> draws("imitation", 3)[0], len(draws("imitation", 8))
+        ((), 4)
+    """
+    space, generator = kind_of(method).space, random.Random(seed)
+    found: list[tuple[str, ...]] = [()]
+    for _ in range(100 * trials):
+        if len(found) >= trials:
+            break
+        drawn = tuple(f"{name}={generator.choice(values)}" for name, values in space.items())
+        if drawn and drawn not in found:
+            found.append(drawn)
+    return found[:trials]
+
+
+@torch.no_grad()
+def merit(method: SafetyMethod, env: SafetyEnv, *, states: int = 400, horizon: int = 60, seed: int = SEED) -> float:
+    r"""What a fitted method is worth: claimed states that it keeps out of U, less ten times those that it does not.
+
+    .. math:: M = \frac1n \bigl( \#\{\text{claimed, kept}\} - 10\, \#\{\text{claimed, lost}\} \bigr)
+
+    over n uniform states outside U, half of them under a harmless and half under an adversarial nominal policy. Of a method
+    that claims nothing all states count as claimed and the lost ones as nothing. The true kernel is not asked. Source: none.
+
+    Example:
+        >>> from torchrl_sspl.baselines import BUDGETS, make
+        >>> from torchrl_sspl.envs import PendulumEnv
+        >>> env, worth = PendulumEnv(), []
+        >>> for name in ("lqr", "box_margin"):
+        ...     method = make(name)
+        ...     method.fit(None, env, BUDGETS["tiny"], 0)
+        ...     worth.append(merit(method, env, states=60, horizon=30))
+        >>> worth[0] > 0 > worth[1]
+        True
+    """
+    outside = env.state_space - env.unsafe_set
+    start = outside.sample(states, torch.Generator().manual_seed(seed))
+    value = barrier_on(method, env, start)
+    claimed = torch.ones(states, dtype=torch.bool) if value is None else value <= 0
+    lost = torch.zeros(states, dtype=torch.bool)
+    for k, make in enumerate((harmless, adversarial)):
+        rows = claimed.nonzero()[:, 0][k :: len(NOMINALS)]
+        if len(rows):
+            lost[rows] = paths(method, env, start[rows], make(env), horizon)[1]
+    price = 0.0 if value is None else LOST
+    return float(((claimed & ~lost).sum() - price * lost.sum()) / states)
+
+
+def search(trial: Callable[[Sequence[str]], float], options: Sequence[Sequence[str]]) -> tuple[Sequence[str], list[dict[str, Any]]]:
+    """The options of the largest merit, the first of them, and what every trial was worth. Source: none.
+
+    Example:
+        >>> search(lambda words: float(len(words)), [(), ("a=1",)])
+        (('a=1',), [{'options': [], 'merit': 0.0}, {'options': ['a=1'], 'merit': 1.0}])
+    """
+    told = [{"options": list(words), "merit": trial(words)} for words in options]
+    best = max(range(len(told)), key=lambda k: (told[k]["merit"], -k))
+    return options[best], told
+
+
+__all__ = ["LOST", "SEED", "draws", "merit", "search"]

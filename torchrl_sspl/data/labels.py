@@ -1,0 +1,65 @@
+"""Few labels, and wrong ones: which of the labels that an environment gives a run may use."""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.seeds import spawn
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+
+
+class Labels:
+    """At most so many labels of S and of U, those that come first; what comes later is unlabelled. Some of them are wrong.
+
+    A label that is wrong says S of a picture of U, or U of one of S, and counts as what it says. Source: none; the paper's title
+    asks for few labels.
+
+    Args:
+        safe, unsafe: labels of S and of U, at most; None: all.
+        wrong: chance that a label is the other one, in [0, 1].
+        seed: of which are wrong.
+
+    Raises ConfigError for other values.
+
+    Example:
+        >>> Labels(safe=1)(torch.tensor([[1], [2], [1], [0]])).flatten().tolist()
+        [1, 2, 0, 0]
+    """
+
+    def __init__(self, *, safe: int | None = None, unsafe: int | None = None, wrong: float = 0.0, seed: int = 0) -> None:
+        if any(n is not None and n < 0 for n in (safe, unsafe)) or not 0.0 <= wrong <= 1.0:
+            raise ConfigError(f"labels: expected safe and unsafe >= 0 or None, and wrong in [0, 1], received {safe!r}, {unsafe!r}, {wrong!r}")
+        self.most, self.wrong, self.seed = {SAFE: safe, UNSAFE: unsafe}, float(wrong), seed
+
+    def less(self, safe: int, unsafe: int, *, seed: int) -> Labels:
+        """What is left of them when so many have been used; other ones are wrong."""
+        other = copy.copy(self)
+        other.most = {code: None if n is None else max(0, n - used) for (code, n), used in zip(self.most.items(), (safe, unsafe), strict=True)}
+        other.seed = seed
+        return other
+
+    def __call__(self, region: Tensor, held: Tensor | None = None, position: int = 0) -> Tensor:
+        """Labels ``(n, 1)`` in place of true ones, behind those that are held already ``(m,)``; other ones are wrong at every position.
+
+        Raises ShapeError for another shape.
+        """
+        if region.ndim != 2 or region.shape[1] != 1:
+            raise ShapeError(f"labels: expected (n, 1), received {tuple(region.shape)}")
+        found = region.clone()
+        if self.wrong:
+            draw = torch.Generator().manual_seed(spawn(self.seed, "labels", position))
+            mistaken = (torch.rand(region.shape, generator=draw) < self.wrong) & (region != UNLABELLED)
+            found = torch.where(mistaken, SAFE + UNSAFE - found, found)
+        for code, most in self.most.items():
+            if most is not None:
+                mine = found == code
+                before = 0 if held is None else int((held == code).sum())
+                found[mine & (mine.cumsum(0) + before > most)] = UNLABELLED
+        return found
+
+
+__all__ = ["Labels"]
