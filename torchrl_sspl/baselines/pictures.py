@@ -117,7 +117,8 @@ class Album:
             self._kept.move_to_end(key)
             yield from self._kept[key]
             return
-        kept, size = [], 0
+        kept: list[Tensor] = []
+        size = 0
         for part in state.split(_ROWS):
             seen = self._draw(part, shift, small)
             size += seen.nbytes
