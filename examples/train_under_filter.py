@@ -99,7 +99,7 @@ class HoldAngle(Task):
 class ReachGoal(Task):
     """From the left of the obstacle to its right, on a car that turns as late as the walking robot does."""
 
-    agent, envs, longest, most, goal, near = "quadruped", 40, 70, "at most 5", (1.5, 0.0), 0.4
+    agent, envs, longest, most, goal, near = "quadruped", 40, 70, "about 5 at best", (1.5, 0.0), 0.4
 
     def env(self, seed: int) -> sspl.envs.SafetyEnv:
         start = sspl.sets.Box([-1.9, -0.7, -0.5, -2.0], [-1.6, 0.7, 0.5, 2.0])
