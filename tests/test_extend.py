@@ -23,7 +23,7 @@ if not (ROOT / "docs").is_dir():
     pytest.skip("needs a checkout", allow_module_level=True)
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:init_random_frames")
 BILL = {
-    "my_encoder.py": "an encoder", "my_system.py": "a system", "my_loss.py": "a loss term", "my_layer.py": "a layer that proofs understand",
+    "my_encoder.py": "an encoder", "my_system.py": "a system", "my_loss.py": "a loss term", "my_layer.py": "a layer that the proofs know",
     "my_rival.py": "a method to compare with", "my_phase.py": "a phase",
 }  # fmt: skip
 FAST = ["evaluation.kernel_grid=31", "evaluation.renderer_episodes=0"]

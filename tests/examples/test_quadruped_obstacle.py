@@ -46,7 +46,7 @@ def test_a_run_writes_numbers_figures_report_and_agent(trained):
     assert "Certificate" in page
     # It is trained on the car that turns late, and says so.
     assert json.loads((directory / "agent" / "agent.json").read_text())["config"]["env"]["yaw_lag"] == [0.048, 0.063]
-    assert "turns as late as the walking robot" in page
+    assert "turns with the delay of the walking robot" in page
 
 
 def test_every_phase_was_run_in_both_rounds(trained):

@@ -114,7 +114,7 @@ def test_the_car_is_shown_by_heading_and_its_walks_from_its_own_description(tmp_
     assert "went wrong (1)" in [t.get_text() for t in figures["Walks in full physics"].legends[0].get_texts()]
     page = page_of(outcome)
     assert "<h1>My car</h1>" in page
-    assert "those of the car that turns at once" in page
+    assert "those of a car that turns at once" in page
     assert "The closest call in full physics" in page
     assert "walks from S that fall" in page  # not measured, and said so
     assert "not measured" in page

@@ -69,8 +69,8 @@ def render(template: str, **values: Any) -> str:
     """A template filled with values; texts are escaped, a value that is missing is an error. Source: none.
 
     Example:
-        >>> render("certificate.html", level="0", agent="<b>", weights="ab", layers=[]).splitlines()[1][:57]
-        '<p>About the set {B &le; 0} of the agent <b>&lt;b&gt;</b>'
+        >>> render("certificate.html", level="0", agent="<b>", weights="ab", layers=[]).splitlines()[1][:63]
+        '<p>It is about the set {B &le; 0} of the agent <b>&lt;b&gt;</b>'
     """
     return _templates().get_template(template).render(**values)
 
