@@ -299,6 +299,20 @@ def test_requirements_come_from_the_system_where_the_numbers_do_not_name_them():
     assert (row.must, row.verdict) == (">= 0.5", "must")
 
 
+@pytest.mark.parametrize(
+    ("value", "upper", "said"),
+    [
+        (0.0, 0.05, "must reached"), (0.0, 0.2, "of 1: 1 with too few episodes"), (0.3, 0.4, "of 1: 1 missed"), (None, None, "of 1: 1 not measured"),
+    ],
+)  # fmt: skip
+def test_a_run_is_green_only_where_the_bounds_reach_and_nothing_is_missing(tmp_path, value, upper, said):
+    one = run("a", value)
+    one.metrics["measurements"]["own"]["leave"] |= {"lower": 0.0, "upper": upper}
+    overview = page.compare([one], tmp_path / "page.html").read_text().split("</section>")[0]
+    assert said in overview.replace("&nbsp;", " ")
+    assert ("badge good" in overview) == (said == "must reached")
+
+
 def test_a_page_of_hostile_names_is_harmless(tmp_path):
     one = run("<script>alert(1)</script>", 0.02, optim={"lr": "<b>"})
     html = page.compare([one, run("b", 0.1)], tmp_path / "page.html", title="<i>").read_text()

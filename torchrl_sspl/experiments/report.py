@@ -242,10 +242,12 @@ def _film(outcome: Outcome, env: SafetyEnv | None, folder: Path) -> tuple[Path |
             last = Opening(f"The closest of {len(in_physics)} measured walks", tuple(closest[0])), closest[1]
         scenes = film.scenes(openings, last)
         plane = _plane(twin) if twin.state_dim > 1 else None
-        path = animate(scenes, path, plane=plane, levels=film.levels(arrays) if plane else None, fps=film.rate)
+        levels = film.levels(arrays) if plane else None
+        path = animate(scenes, path, plane=plane, levels=levels, fps=film.rate)
     finally:
         film.close()
-    return path, _CAPTION.format("in full physics" if closest is not None else "on the true dynamics")
+    caption = _CAPTION.format("in full physics" if closest is not None else "on the true dynamics")
+    return path, caption + (" The dashed line is the border of the true kernel." if levels and "kernel" in levels[1] else "")
 
 
 def _recorded(episodes: Episodes, path: Path, title: str, twin: SafetyEnv | None = None) -> Path | None:

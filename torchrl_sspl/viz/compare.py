@@ -16,8 +16,8 @@ from torchrl_sspl.envs.system import Requirement
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.curves import COLOURS, panels, read_log
-from torchrl_sspl.viz.pages import Cell, Picture, Table, render
-from torchrl_sspl.viz.report import badge, bounded, file_uri, format_value, verdict_in
+from torchrl_sspl.viz.pages import Badge, Cell, Picture, Table, render
+from torchrl_sspl.viz.report import MARKS, SEEN, badge, bounded, file_uri, format_value, verdict_in, verdict_kind
 
 _OWN = ("out_dir", "seed", "trainer.progress", "logger.kind", "logger.project")  # no settings of what is compared
 
@@ -208,15 +208,24 @@ def compare(runs: Sequence[str | Path] | Sequence[Run], path: str | Path, *, tit
 def _overview(runs: Sequence[Run]) -> Table:
     cells: list[list[str | Cell]] = []
     for run in runs:
-        m, verdicts = run.metrics, list(run.metrics.get("verdicts", {}).values())
-        missed = sum(not str(v).startswith(("aim", "must")) for v in verdicts)
-        verdict = "not measured" if not verdicts else f"missed {missed} of {len(verdicts)}" if missed else "must"
-        seconds = m.get("training_seconds")
+        m, seconds = run.metrics, run.metrics.get("training_seconds")
         cells.append([
             Cell(run.name, "code"), _show(run.settings.get("seed")), "" if seconds is None else f"{seconds / 60:.1f} min",
-            str(m.get("stop_reason", "") if run.finished else "not finished"), Cell(badge=badge(verdict)),
+            str(m.get("stop_reason", "") if run.finished else "not finished"), Cell(badge=_standing(run)),
         ])  # fmt: skip
     return Table(["Run", "Seed", "Training", "Why it ended", "Requirements"], cells)
+
+
+def _standing(run: Run) -> Badge:
+    """How many requirements a run misses, or leaves open; green only where every bound reaches its must."""
+    verdicts = [r.verdict for r in rows_of([run]) if r.must]
+    kinds = [verdict_kind(v) for v in verdicts if v not in SEEN]
+    words = {"bad": "missed", "fair": "with too few episodes", "none": "not measured"}
+    left = {kind: f"{kinds.count(kind)} {text}" for kind, text in words.items() if kind in kinds}
+    if not left:
+        return badge("must" if verdicts else "not measured")
+    worst = next(iter(left))
+    return Badge(worst, MARKS[worst], f"of {len(verdicts)}: {', '.join(left.values())}")
 
 
 def _tables(rows: Sequence[Row]) -> list[tuple[str, Table]]:

@@ -102,15 +102,18 @@ def verdict_kind(verdict: str) -> str:
     return "none" if not text or text.startswith("not measured") else "bad"
 
 
-_UNCERTAIN = ("none seen", "all seen", "too few episodes")
-_BADGES = {"good": "\u2713", "fair": "\u2248", "bad": "\u2717", "none": "?"}
+#: Verdicts on what no sample can prove, as nothing lies beyond the must.
+SEEN = ("none seen", "all seen")
+_UNCERTAIN = (*SEEN, "too few episodes")
+#: Marks of the kinds of a verdict.
+MARKS = {"good": "\u2713", "fair": "\u2248", "bad": "\u2717", "none": "?"}
 _WORDS = {"aim": "aim reached", "must": "must reached"}
 
 
 def badge(verdict: str) -> Badge:
     """A verdict ("aim", "must", "proved", "yes", "pass": good; see ``bounded``: fair; "not measured"; else bad) as a mark."""
     kind = verdict_kind(verdict)
-    return Badge(kind, _BADGES[kind], _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or _NOT_MEASURED))
+    return Badge(kind, MARKS[kind], _WORDS.get(str(verdict).strip().lower(), str(verdict).strip() or _NOT_MEASURED))
 
 
 def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple[str, Any, str, str, str]]:
@@ -340,7 +343,7 @@ def write_report(
         first, kind, more = headline
     lists = (proved, measured or _measured_lines(summary, data), _ASSUMED if assumed is None else assumed)
     page = render(
-        "report.html", title=title, facts=" / ".join(_facts(config)), headline=first, kind=kind, mark=_BADGES[kind], more=more,
+        "report.html", title=title, facts=" / ".join(_facts(config)), headline=first, kind=kind, mark=MARKS[kind], more=more,
         columns=_columns(lists), kernel=kernel, film=None if video is None else _film(Path(video), video_caption),
         requirements=requirements, certificate=certificate or "", notes=_paragraphs(notes),
         figures=[_figure(n, f) for n, f in (figures or {}).items()], checks=_sizes(checks) if checks else None,
@@ -359,7 +362,7 @@ def _columns(lists: Sequence[Sequence[str | tuple[str, str]]]) -> list[tuple[str
 def item(given: str | tuple[str, str]) -> Badge:
     """A sentence, with the mark of its kind where it has one."""
     kind, text = ("none", given) if isinstance(given, str) else given
-    return Badge(kind, "" if kind == "none" else _BADGES[kind], str(text))
+    return Badge(kind, "" if kind == "none" else MARKS[kind], str(text))
 
 
 def _facts(config: Mapping[str, Any]) -> list[str]:

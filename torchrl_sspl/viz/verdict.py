@@ -8,7 +8,7 @@ from typing import Any
 
 from torchrl_sspl.certification.certificate import PROVED, Certificate, Layer, Reason, Statement
 from torchrl_sspl.certification.rounding import down, missed, shown, up
-from torchrl_sspl.viz.report import format_value, verdict_kind
+from torchrl_sspl.viz.report import SEEN, format_value, verdict_kind
 
 #: A kind ("good", "fair", "bad" or "none") and a sentence.
 Item = tuple[str, str]
@@ -87,7 +87,7 @@ def first_screen(
     run_time = certificate.layers.get("run-time")
     if run_time is not None and proof.holds:
         parts.append(_covered(run_time))
-    of_parts, of_rows = [kind for kind, _ in parts], [k for k, row in zip(kinds, rows, strict=True) if row[4] not in _SEEN]
+    of_parts, of_rows = [kind for kind, _ in parts], [k for k, row in zip(kinds, rows, strict=True) if row[4] not in SEEN]
     worst = _worst(of_parts + of_rows)
     said = _word(proof, of_parts, of_rows) + ": " + "; ".join(text for _, text in parts) + "."
     paper = certificate.layers.get("paper")
@@ -98,9 +98,6 @@ def first_screen(
 
 def _joined(sentences: Sequence[str]) -> str:
     return "".join(f"{s}. " for s in sentences).rstrip()
-
-
-_SEEN = ("none seen", "all seen")
 
 
 def _worst(kinds: Sequence[str]) -> str:
@@ -159,7 +156,7 @@ def _of_run(rows: Sequence[Sequence[Any]], kinds: Sequence[str]) -> list[str]:
             said.append(f"In this run, {label}: {m.events or 'none'} of {m.n:,} (at most {up(100 * m.upper, 3)} %)")
             break
     bad = kinds.count("bad")
-    unsure = sum(kind == "fair" and row[4] not in _SEEN for kind, row in zip(kinds, rows, strict=True))
+    unsure = sum(kind == "fair" and row[4] not in SEEN for kind, row in zip(kinds, rows, strict=True))
     if bad:
         said.append(f"{bad} of {len(rows)} requirements {'is' if bad == 1 else 'are'} missed")
     if unsure:
