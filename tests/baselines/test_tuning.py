@@ -72,19 +72,19 @@ def test_the_first_of_the_best_is_chosen():
 
 def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(kind_of("imitation"), "space", {"steps": (3, 5)})
+    monkeypatch.setattr(kind_of("nerf_cbf"), "space", {"steps": (3, 5)})
     words = ["steps=2", "trials=3", *SMALL]
-    first = run_cell(Cell.of("imitation", ["seed=0", *words]))
+    first = run_cell(Cell.of("nerf_cbf", ["seed=0", *words]))
     assert first["cell"]["trials"] == 3
     assert len(first["tuning"]["trials"]) == 3
     assert first["tuning"]["chosen"] in [t["options"] for t in first["tuning"]["trials"]]
-    path = tmp_path / "runs/baselines/pendulum/tiny/imitation-steps-2-trials-3" / TRIALS_FILE
+    path = tmp_path / "runs/baselines/pendulum/tiny/nerf_cbf-steps-2-trials-3" / TRIALS_FILE
     told = json.loads(path.read_text())
     told["chosen"] = ["steps=5"]
     path.write_text(json.dumps(told))
-    assert run_cell(Cell.of("imitation", ["seed=1", *words]))["tuning"]["chosen"] == ["steps=5"]
-    assert "tuning" not in run_cell(Cell.of("imitation", ["steps=2", *SMALL]))
+    assert run_cell(Cell.of("nerf_cbf", ["seed=1", *words]))["tuning"]["chosen"] == ["steps=5"]
+    assert "tuning" not in run_cell(Cell.of("nerf_cbf", ["steps=2", *SMALL]))
     assert Cell.of("lqr", ["trials=8"]).trials == 0
     assert SEED not in (0, 1, 2)
     with pytest.raises(ConfigError, match="expected trials to be an integer"):
-        Cell.of("imitation", ["trials=few"])
+        Cell.of("nerf_cbf", ["trials=few"])
