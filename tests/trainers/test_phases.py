@@ -197,6 +197,23 @@ def test_counterexamples_that_no_sample_hits_are_climbed_to():
     assert float(found[:, 0].max()) <= 0.02
 
 
+@pytest.mark.parametrize("ascent", [False, True])
+def test_tightening_finds_what_samples_miss_where_it_climbs(ascent):
+    """The next barrier value is a cone, above zero in a millionth of the domain."""
+    peak = torch.tensor([-0.5, 0.3, -0.2])
+
+    def step(z, u):
+        return torch.cat([0.005 - (z - peak).norm(dim=1, keepdim=True), z[:, 1:]], 1)
+
+    work = SimpleNamespace(
+        barrier=lambda z: z[:, :1], dynamics=step, acting=lambda z: z[:, :1], direction=None, loop=InnerLoop(0), latent_dim=3, seen_dim=None,
+        counterexamples=torch.zeros(0, 3), lipschitz_bound=1.0, config=SynthesisConfig(ascent=ascent),
+    )  # fmt: skip
+    found = synthesis.Tighten._search(synthesis.Tighten(), work, torch.zeros(100, 3))
+    highest = float(step(found, None)[:, 0].max()) if len(found) else -1.0
+    assert (highest > 0.004) == ascent
+
+
 def test_targets_on_a_grid_are_settled_in_place_of_a_fine_tuning():
     kinds = [type(phase) for phase in synthesis_phases(SynthesisConfig(grid=9, tolerated_error=0.01))]
     assert kinds[-1] is Settle

@@ -388,8 +388,12 @@ class Tighten(FineTune):
         if not len(z):
             return z
         after = work.dynamics(z, work.acting(z))
-        possible = work.barrier(after)[:, 0] > self._least(work)
-        return self._worst(work, z[possible], after[possible])
+        value = work.barrier(after)[:, 0]
+        possible = value > self._least(work)
+        if not work.config.ascent:
+            return self._worst(work, z[possible], after[possible])
+        climbed = self._ascend(work, z[value.topk(min(_STARTS, len(z))).indices])
+        return self._worst(work, torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))]))
 
     @staticmethod
     def _drawn(work: Workspace, rim: Tensor, samples: int) -> Tensor:
@@ -412,6 +416,25 @@ class Tighten(FineTune):
         value = work.barrier(after + worst_error(work.barrier, after, work.config.tolerated_error))[:, 0] + _SPARE
         worst = value.topk(min(_POOL, len(value)))
         return z[worst.indices[worst.values > -_NEARLY]]
+
+    @staticmethod
+    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 24) -> Tensor:
+        """The best latents of the set that are climbed to from ``(n, p)``: samples alone miss narrow peaks, and so does one climb
+        with steps that shrink. Each climbs on its own, so that not all end on the same peak."""
+        best, highest = latent, torch.full((len(latent),), -math.inf)
+        for attempt in range(restarts):
+            z = best if attempt == 0 else within(best + 0.005 * torch.randn(best.shape, generator=work.loop.generator), work.direction)
+            for k in range(steps):
+                with torch.enable_grad():
+                    at = z.detach().requires_grad_()
+                    here = work.barrier(at)[:, 0]
+                    value = work.barrier(work.dynamics(at, work.acting(at).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
+                    (slope,) = torch.autograd.grad(value.sum(), at)
+                z = within(z + 0.03 * 0.85**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
+            value = work.barrier(work.dynamics(z, work.acting(z)))[:, 0].masked_fill(work.barrier(z)[:, 0] > _SPARE, -math.inf)
+            better = value > highest
+            best, highest = torch.where(better[:, None], z, best), torch.where(better, value, highest)
+        return best[highest > -math.inf]
 
 
 class Settle(Tighten):
@@ -477,25 +500,6 @@ class Settle(Tighten):
         climbed = self._ascend(work, z[starts])
         possible = (value > self._least(work)) & (here <= _INSIDE)
         return self._worst(work, torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))]))
-
-    @staticmethod
-    def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 24) -> Tensor:
-        """The best latents of the set that are climbed to from ``(n, p)``: samples alone miss narrow peaks, and so does one climb
-        with steps that shrink. Each climbs on its own, so that not all end on the same peak."""
-        best, highest = latent, torch.full((len(latent),), -math.inf)
-        for attempt in range(restarts):
-            z = best if attempt == 0 else within(best + 0.005 * torch.randn(best.shape, generator=work.loop.generator), work.direction)
-            for k in range(steps):
-                with torch.enable_grad():
-                    at = z.detach().requires_grad_()
-                    here = work.barrier(at)[:, 0]
-                    value = work.barrier(work.dynamics(at, work.acting(at).detach()))[:, 0] - 20.0 * here.clamp_min(0.0)
-                    (slope,) = torch.autograd.grad(value.sum(), at)
-                z = within(z + 0.03 * 0.85**k * slope / slope.norm(dim=1, keepdim=True).clamp_min(1e-9), work.direction)
-            value = work.barrier(work.dynamics(z, work.acting(z)))[:, 0].masked_fill(work.barrier(z)[:, 0] > _SPARE, -math.inf)
-            better = value > highest
-            best, highest = torch.where(better[:, None], z, best), torch.where(better, value, highest)
-        return best[highest > -math.inf]
 
 
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
