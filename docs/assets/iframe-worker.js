@@ -3,10 +3,10 @@ if (location.protocol === "file:") {
   window.Worker = class extends EventTarget {
     constructor(url) {
       super()
-      this.queue = []  // messages that come before the script has loaded
       this.frame = document.createElement("iframe")
       this.frame.hidden = true
-      this.frame.onload = () => this.start(url)
+      // Messages that come before the script has loaded wait for it, in their order.
+      this.ready = new Promise(shown => { this.frame.onload = shown }).then(() => this.start(url))
       document.documentElement.append(this.frame)
     }
 
@@ -19,15 +19,11 @@ if (location.protocol === "file:") {
       })
       inside.importScripts = (...addresses) => addresses.reduce((last, next) => last.then(() => load(next)), Promise.resolve())
       inside.postMessage = data => this.dispatchEvent(new MessageEvent("message", {data}))
-      load(url).then(() => { this.ready = true; this.queue.forEach(data => this.pass(data)) })
-    }
-
-    pass(data) {
-      this.frame.contentWindow.dispatchEvent(new MessageEvent("message", {data}))
+      return load(url)
     }
 
     postMessage(data) {
-      this.ready ? this.pass(data) : this.queue.push(data)
+      this.ready.then(() => this.frame.contentWindow.dispatchEvent(new MessageEvent("message", {data})))
     }
 
     terminate() {

@@ -390,10 +390,9 @@ class Tighten(FineTune):
         after = work.dynamics(z, work.acting(z))
         value = work.barrier(after)[:, 0]
         possible = value > self._least(work)
-        if not work.config.ascent:
-            return self._worst(work, z[possible], after[possible])
-        climbed = self._ascend(work, z[value.topk(min(_STARTS, len(z))).indices])
-        return self._worst(work, torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))]))
+        if work.config.ascent:
+            return self._climbed(work, z, after, possible, value)
+        return self._worst(work, z[possible], after[possible])
 
     @staticmethod
     def _drawn(work: Workspace, rim: Tensor, samples: int) -> Tensor:
@@ -416,6 +415,11 @@ class Tighten(FineTune):
         value = work.barrier(after + worst_error(work.barrier, after, work.config.tolerated_error))[:, 0] + _SPARE
         worst = value.topk(min(_POOL, len(value)))
         return z[worst.indices[worst.values > -_NEARLY]]
+
+    def _climbed(self, work: Workspace, z: Tensor, after: Tensor, possible: Tensor, promise: Tensor) -> Tensor:
+        """The worst of those that are possible, and of what is climbed to from those that promise most."""
+        top = self._ascend(work, z[promise.topk(min(_STARTS, len(z))).indices])
+        return self._worst(work, torch.cat([z[possible], top]), torch.cat([after[possible], work.dynamics(top, work.acting(top))]))
 
     @staticmethod
     def _ascend(work: Workspace, latent: Tensor, restarts: int = 3, steps: int = 24) -> Tensor:
@@ -496,10 +500,8 @@ class Settle(Tighten):
         after = work.dynamics(z, work.acting(z))
         value = work.barrier(after)[:, 0]
         # Where the set ends in a cusp, more samples lie beside it than in it.
-        starts = (value - 3.0 * here.clamp_min(0.0)).topk(min(_STARTS, len(z))).indices
-        climbed = self._ascend(work, z[starts])
         possible = (value > self._least(work)) & (here <= _INSIDE)
-        return self._worst(work, torch.cat([z[possible], climbed]), torch.cat([after[possible], work.dynamics(climbed, work.acting(climbed))]))
+        return self._climbed(work, z, after, possible, value - 3.0 * here.clamp_min(0.0))
 
 
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
