@@ -7,9 +7,11 @@ import torch
 
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import EmptyRegionError
-from torchrl_sspl.modules import ContrastEncoder
+from torchrl_sspl.lipschitz import SandwichBarrier
+from torchrl_sspl.modules import ContrastEncoder, LatentDynamics, Policy
 from torchrl_sspl.modules import contrast as module
-from torchrl_sspl.modules.agent import build_encoder
+from torchrl_sspl.modules.agent import Agent, build_encoder
+from torchrl_sspl.modules.export import DeployedStep
 from torchrl_sspl.runtime import CameraFault
 
 
@@ -59,6 +61,16 @@ def test_it_is_built_again_from_its_arguments(scene):
     twin = build_encoder("ContrastEncoder", **encoder.arguments).eval()
     twin.load_state_dict(encoder.state_dict())
     assert torch.equal(twin(pixels), encoder(pixels))
+
+
+def test_its_agents_are_exported_for_batches_of_any_size(scene, tmp_path):
+    encoder, pixels = scene
+    agent = Agent.from_networks(encoder, LatentDynamics(3, 1), SandwichBarrier(3, (8,)), Policy(3, 1), gain=0.2)
+    step = torch.export.load(agent.export(tmp_path / "agent.pt2", check=8)).module()
+    given = pixels[:5].roll(1, -1), torch.zeros(5, 3), torch.zeros(5, 1), torch.ones(5, dtype=torch.bool)
+    with torch.no_grad():
+        for found, wanted in zip(step(*given), DeployedStep(agent)(*given), strict=True):
+            assert torch.allclose(found.float(), wanted.float(), atol=1e-5)
 
 
 def test_too_few_frames_are_named():

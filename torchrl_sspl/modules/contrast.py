@@ -113,7 +113,7 @@ class Contrast(nn.Module):
         if not (torch.compiler.is_compiling() or torch.compiler.is_exporting()) and bool((best == still).all()):
             return frames  # most often; nothing to sample anew
         by = self.shifts[best].flip(-1) * (2.0 / frames.shape[-1])  # to the right, down
-        to = torch.cat([torch.eye(2, device=by.device).expand(len(by), 2, 2), by[..., None]], 2)
+        to = torch.cat([torch.eye(2, device=by.device).expand(by.shape[0], 2, 2), by[..., None]], 2)
         grid = F.affine_grid(to, list(frames.shape), align_corners=False)
         return F.grid_sample(frames, grid, padding_mode="border", align_corners=False)
 
