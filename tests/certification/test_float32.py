@@ -284,6 +284,25 @@ def test_rounding_of_a_domain_bounds_that_of_its_points(seed):
         assert float((value.double() - graph(z)).norm(dim=1).max()) < float(at_points.max()) <= fine <= coarse
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_rounding_where_the_barrier_is_low_bounds_that_of_its_points_there(seed):
+    system, (_, dynamics, policy) = loop(seed, width=16)
+    z = 2 * torch.rand(3000, 2, generator=torch.Generator().manual_seed(seed)) - 1
+    low = z[system.barrier(z)[:, 0] <= float(system.barrier(z).quantile(0.3))]
+    level = float(system.barrier(low).max())
+    off = (dynamics(low, policy(low)).double() - system.step(low)).norm(dim=1).max()
+    everywhere, there = (largest_rounding(system.step, system.low, system.high, U, boxes=2048, where=w) for w in (None, (system.barrier, level)))
+    assert float(off) < there <= everywhere
+    assert largest_rounding(system.step, system.low, system.high, U, where=(system.barrier, -1e6)) == 0.0  # nowhere
+
+
+def test_rounding_of_the_step_counts_where_the_set_is():
+    steep = nn.Sequential(linear([[1e3]], [-900.0]), nn.ReLU(), linear([[1e-3]]))  # a policy that is large from z = .9 on
+    barrier, plant = nn.Sequential(linear([[1.0]])), nn.Sequential(linear([[0.5, 1e3]]))
+    system = closed_loop(barrier, plant, steep, latent_dim=1, lipschitz_bound=1.0)
+    assert system.rounding(U, level=0.0)[1] < 0.1 * system.rounding(U)[1]
+
+
 # --- the statement ----------------------------------------------------------------------------------------------------
 
 

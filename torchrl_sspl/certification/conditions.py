@@ -220,7 +220,7 @@ class ComputedError:
 
     delta: float  # proved for the computed barrier and step, latent units; at most zero: not kept even without errors
     barrier_rounding: float  # what the computed barrier is off at most, anywhere, barrier units
-    step_rounding: float  # the same of the computed d(z, pi(z)), Euclidean norm, latent units
+    step_rounding: float  # the same of the computed d(z, pi(z)) where the computed barrier is at most s, Euclidean norm, latent units
 
 
 def computed_error(
@@ -231,15 +231,15 @@ def computed_error(
     unit: float = 2.0**-24,
     tolerance: float = 1e-3,
     budget: Budget | None = None,
-    boxes: int = 8192,
+    boxes: int = 16384,
 ) -> ComputedError:
     r"""Largest error for which :math:`\{\hat B \le s\}` is kept by the networks as they are computed.
 
     .. math:: \delta = - \frac{1}{L_B} \left( \max_{B(z) \le s + \epsilon_B} (B(d(z, \pi(z))) - s) + \epsilon_B \right)
         - \epsilon_d
 
-    with :math:`\epsilon_B \ge |\hat B - B|` and :math:`\epsilon_d \ge \|\hat d(z, \hat\pi(z)) - d(z, \pi(z))\|` on the
-    whole domain, bounded on so many boxes for this unit roundoff; ``known`` is the error in real arithmetic.
+    with :math:`\epsilon_B \ge |\hat B - B|` on the whole domain and :math:`\epsilon_d \ge \|\hat d(z, \hat\pi(z)) - d(z, \pi(z))\|`
+    where :math:`B(z) \le s + \epsilon_B`, bounded on so many boxes for this unit roundoff; ``known`` is the error in real arithmetic.
 
     A policy that chooses does so by what is computed. With :math:`\lambda = \epsilon_B + L_B \epsilon_d` it is the largest
     :math:`\delta` for which
@@ -251,7 +251,7 @@ def computed_error(
     after the step (Theorem H in ``docs/theory.md``).
     """
     lipschitz = system.lipschitz_bound
-    of_barrier, of_step = system.rounding(unit, boxes=boxes)
+    of_barrier, of_step = system.rounding(unit, level=level, boxes=boxes)
     if not math.isfinite(of_barrier + of_step):
         return ComputedError(-math.inf, of_barrier, of_step)
     lost = of_step + of_barrier / lipschitz

@@ -75,11 +75,21 @@ def rounding_bound(
     return errors
 
 
-def largest_rounding(graph: Graph, low: Tensor, high: Tensor, unit: float, *, boxes: int = 8192, vectors: int = 1) -> float:
+def largest_rounding(
+    graph: Graph,
+    low: Tensor,
+    high: Tensor,
+    unit: float,
+    *,
+    boxes: int = 16384,
+    vectors: int = 1,
+    where: tuple[Graph, float] | None = None,
+) -> float:
     """Bound of the Euclidean norm of the last step's rounding error anywhere on a domain; infinity where there is none.
 
     The domain from ``low`` to ``high``, ``(p,)`` float64, is cut into about so many boxes, the worst ones first. Of several vectors
-    of one size, which the step holds side by side, it is the largest norm.
+    of one size, which the step holds side by side, it is the largest norm. With ``where``, a barrier and a level, it is that of the
+    points at which the barrier is at most the level: boxes on which it is proved to be larger are left out.
 
     Example:
         >>> graph = Graph(2)
@@ -91,7 +101,7 @@ def largest_rounding(graph: Graph, low: Tensor, high: Tensor, unit: float, *, bo
     least, most = low[None], high[None]
     bound = torch.full((1,), torch.inf, dtype=torch.float64)
     count = 0
-    while count < boxes:
+    while count < boxes and len(bound):
         worst = bound.topk(min(512, len(bound))).indices
         rest = torch.ones_like(bound, dtype=torch.bool)
         rest[worst] = False
@@ -99,11 +109,14 @@ def largest_rounding(graph: Graph, low: Tensor, high: Tensor, unit: float, *, bo
         axis = (b - a).argmax(1, keepdim=True)
         middle = (0.5 * (a + b)).gather(1, axis)
         a, b = torch.cat([a, a.scatter(1, axis, middle)]), torch.cat([b.scatter(1, axis, middle), b])
+        count += len(a)
+        if where is not None:
+            meets = Enclosure(where[0], a, b).interval()[0][:, 0] <= where[1]
+            a, b = a[meets], b[meets]
         each = rounding_bound(graph, a, b, unit, refined=True)[-1].unflatten(1, (vectors, -1))
         error = each.norm(dim=2).nan_to_num(nan=torch.inf).amax(1)
         least, most, bound = torch.cat([least[rest], a]), torch.cat([most[rest], b]), torch.cat([bound[rest], error])
-        count += len(a)
-    return float(bound.max()) * _SAFETY
+    return float(bound.max()) * _SAFETY if len(bound) else 0.0
 
 
 def _affine(step: Affine, errors: list[Tensor], sizes: list[Tensor], unit: float) -> tuple[Tensor, Tensor, Tensor]:

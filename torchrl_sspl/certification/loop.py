@@ -16,7 +16,7 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
-from torchrl_sspl.certification.branch_and_bound import Problem
+from torchrl_sspl.certification.branch_and_bound import SLACK, Problem
 from torchrl_sspl.certification.floating import largest_rounding, more_than, rounding_bound
 from torchrl_sspl.certification.graph import Graph
 from torchrl_sspl.direction import Direction, direction_of, lifted, within
@@ -113,10 +113,13 @@ class ClosedLoop:
         """What B may rise by with an error, latent units, by the Lipschitz constant; barrier units, rounded up."""
         return more_than(self.lipschitz_bound * error) if error else 0.0
 
-    def rounding(self, unit: float, *, boxes: int = 8192) -> tuple[float, float]:
-        """What an evaluation with a unit roundoff is off at most, anywhere: of B, and of d(z, pi(z)) (Euclidean norm)."""
-        step = largest_rounding(self.step, self.low, self.high, unit, boxes=boxes, vectors=len(self.inner))
-        return largest_rounding(self.barrier, self.low, self.high, unit, boxes=boxes), step
+    def rounding(self, unit: float, *, level: float = math.inf, boxes: int = 16384) -> tuple[float, float]:
+        """What an evaluation with a unit roundoff is off at most: of B, anywhere, and of d(z, pi(z)) (Euclidean norm), wherever the
+        computed B is at most a level."""
+        of_barrier = largest_rounding(self.barrier, self.low, self.high, unit, boxes=boxes)
+        where = None if math.isinf(level) else (self.barrier, level + of_barrier + SLACK)
+        step = largest_rounding(self.step, self.low, self.high, unit, boxes=boxes, vectors=len(self.inner), where=where)
+        return of_barrier, step
 
 
 def closed_loop(

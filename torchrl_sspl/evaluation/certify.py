@@ -283,7 +283,7 @@ def premise(agent: Agent, *, budget: Budget | None = None) -> float:
     if not layer.holds or found is None:
         return 0.0
     system, unit = closed_loop(**_loop(agent)), UNITS[next(agent.barrier.parameters()).dtype]
-    rounding: dict[str, Any] = dict(zip(_ROUNDINGS, system.rounding(unit), strict=True))
+    rounding: dict[str, Any] = dict(zip(_ROUNDINGS, system.rounding(unit, level=0.0), strict=True))
     low, high = 0.999 * found, _FARTHEST * found
     budget = replace(budget, boxes=min(budget.boxes, _PATIENCE))
     for _ in range(0 if system.chooses else _HALVINGS):  # the Lipschitz constant says too little where the barrier rises slowly
@@ -489,7 +489,7 @@ def _history(claimed: Certificate, agent: Agent) -> dict[Reason, str]:
 def _is_proved(agent: Agent, level: float, name: str, delta: float, budget: Budget) -> bool | None:
     """Whether the set is kept with errors of delta, by real numbers or by those of a dtype; None: not decided."""
     system = closed_loop(**_loop(agent))
-    rounding = (0.0, 0.0) if name == TOLERATED else system.rounding(UNITS[getattr(torch, name)])
+    rounding = (0.0, 0.0) if name == TOLERATED else system.rounding(UNITS[getattr(torch, name)], level=level)
     of: dict[str, Any] = dict(zip(_ROUNDINGS, rounding, strict=True))
     found = tolerates(system, delta, level=level, every_way=False, budget=budget, **of)
     return {"proved": True, "refuted": False}.get(found.status)
