@@ -296,6 +296,16 @@ def test_rounding_where_the_barrier_is_low_bounds_that_of_its_points_there(seed)
     assert largest_rounding(system.step, system.low, system.high, U, where=(system.barrier, -1e6)) == 0.0  # nowhere
 
 
+def test_rounding_counts_where_the_barrier_has_no_bound():
+    step, barrier = Graph(1), Graph(1)
+    step.network(0, linear([[3.0]], [1.0]))
+    barrier.network(0, nn.Sequential(linear([[1.0]]), nn.ReLU(), linear([[1.0]])))
+    barrier.steps[-1].weights[0].fill_(math.nan)
+    one = torch.ones(1, dtype=torch.float64)
+    everywhere, there = (largest_rounding(step, -one, one, U, boxes=16, where=w) for w in (None, (barrier, 0.0)))
+    assert there == everywhere > 0.0
+
+
 def test_rounding_of_the_step_counts_where_the_set_is():
     steep = nn.Sequential(linear([[1e3]], [-900.0]), nn.ReLU(), linear([[1e-3]]))  # a policy that is large from z = .9 on
     barrier, plant = nn.Sequential(linear([[1.0]])), nn.Sequential(linear([[0.5, 1e3]]))

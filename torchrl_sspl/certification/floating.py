@@ -111,7 +111,7 @@ def largest_rounding(
         a, b = torch.cat([a, a.scatter(1, axis, middle)]), torch.cat([b.scatter(1, axis, middle), b])
         count += len(a)
         if where is not None:
-            meets = Enclosure(where[0], a, b).interval()[0][:, 0] <= where[1]
+            meets = ~(Enclosure(where[0], a, b).interval()[0][:, 0] > where[1])  # a bound that is no number proves nothing
             a, b = a[meets], b[meets]
         each = rounding_bound(graph, a, b, unit, refined=True)[-1].unflatten(1, (vectors, -1))
         error = each.norm(dim=2).nan_to_num(nan=torch.inf).amax(1)
