@@ -46,7 +46,7 @@ from torchrl_sspl.viability.cloud import (
 _VALUE_SCALE = 0.05  # distance of latents in which values of actions are measured
 _SEARCH_EVERY = 250  # steps between two searches for counterexamples
 _SPARE = 0.004  # barrier value by which counterexamples have to be refuted, for what a proof does not resolve
-_WEIGHT, _LEAST_WEIGHT = 2.0, 40.0  # of counterexamples
+_WEIGHT, _LEAST_WEIGHT = 4.0, 40.0  # of counterexamples
 _NEAR_ZERO = 0.06  # of the targets on a grid, those that a batch has as many of as of all
 _POOL = 8192  # counterexamples that are kept
 _LOOK_EVERY = 25  # steps between two searches where hardly any are left
@@ -376,9 +376,15 @@ class Tighten(FineTune):
             work.counterexamples = self._search(work, rim)
         if not len(work.counterexamples):
             return {}
-        rows = work.counterexamples[work.loop.pick(len(work.counterexamples), work.config.batch)]
+        rows = self._worst_first(work)
         terms = self._loss(TensorDict(latent=rows, batch_size=[len(rows)]))
         return {k: _WEIGHT * v if k.startswith("loss") else v for k, v in terms.items()}
+
+    @staticmethod
+    def _worst_first(work: Workspace) -> Tensor:
+        """A batch of the counterexamples, the worst more often: a few real ones are not lost among thousands of near ones."""
+        known = len(work.counterexamples)
+        return work.counterexamples[work.loop.pick(known, work.config.batch).square() // known]
 
     @torch.no_grad()
     def _search(self, work: Workspace, rim: Tensor) -> Tensor:
@@ -390,9 +396,7 @@ class Tighten(FineTune):
         after = work.dynamics(z, work.acting(z))
         value = work.barrier(after)[:, 0]
         possible = value > self._least(work)
-        if work.config.ascent:
-            return self._climbed(work, z, after, possible, value)
-        return self._worst(work, z[possible], after[possible])
+        return self._climbed(work, z, after, possible, value)
 
     @staticmethod
     def _drawn(work: Workspace, rim: Tensor, samples: int) -> Tensor:
@@ -476,8 +480,7 @@ class Settle(Tighten):
                 work.counterexamples = self._search(work, rim["latent"])
             asked = [rim["latent"][pick(len(rim), s.batch)]]
             if len(work.counterexamples):
-                known = len(work.counterexamples)  # the worst come first, and more often
-                asked.append(work.counterexamples[pick(known, s.batch).square() // known])
+                asked.append(self._worst_first(work))
             latent = torch.cat(asked)
             terms = dict(self._loss(TensorDict(latent=latent, batch_size=[len(latent)])).items())
             terms["loss_counterexample"] = _LEAST_WEIGHT * terms["loss_counterexample"]
