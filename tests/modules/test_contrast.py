@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from torch import nn
 
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import EmptyRegionError
@@ -12,6 +13,7 @@ from torchrl_sspl.modules import ContrastEncoder, LatentDynamics, Policy
 from torchrl_sspl.modules import contrast as module
 from torchrl_sspl.modules.agent import Agent, build_encoder
 from torchrl_sspl.modules.export import DeployedStep
+from torchrl_sspl.objectives import SSPLLoss
 from torchrl_sspl.runtime import CameraFault
 
 
@@ -76,3 +78,16 @@ def test_its_agents_are_exported_for_batches_of_any_size(scene, tmp_path):
 def test_too_few_frames_are_named():
     with pytest.raises(EmptyRegionError, match="10 frames"):
         ContrastEncoder(3, 64).fit(torch.zeros(5, 3, 64, 64, dtype=torch.uint8))
+
+
+@pytest.mark.parametrize("encoder", ["ContrastEncoder", "BearingEncoder"])
+def test_a_loss_that_is_loaded_puts_cameras_back_in_place(scene, encoder):
+    _, pixels = scene
+    shifted = CameraFault("shifted", 1.0, onset=0, seed=0)(pixels, 0)
+    losses = [SSPLLoss(build_encoder(encoder, latent_dim=3, image_size=64), LatentDynamics(3, 1), nn.Linear(3, 1), Policy(3, 1)) for _ in "ab"]
+    losses[0].encoder.module.fit(pixels[:, 3:])
+    losses[1].load_state_dict(losses[0].state_dict())
+    with torch.no_grad():
+        seen, loaded = (loss._run("encoder", shifted) for loss in losses)
+        assert torch.equal(seen, loaded)
+        assert torch.equal(seen, losses[0].encoder.module(shifted)), "the loss sees what its encoder sees"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -48,9 +49,10 @@ class Contrast(nn.Module):
     background: Tensor
     light: Tensor
     shifts: Tensor
-    marks: Tensor
-    index: Tensor
+    mixing: Tensor
     around: Tensor
+    marks: Tensor
+    places: Tensor
     weights: Tensor
 
     def __init__(self, size: int, channels: int = 3) -> None:
@@ -59,26 +61,28 @@ class Contrast(nn.Module):
         self.register_buffer("light", torch.full((channels,), 2.0))  # mean over the frame, black counts zero
         reach, steps = REACH * size / 64, int(REACH * _PER_PIXEL)
         along = torch.arange(-steps, steps + 1) * reach / steps
-        self.register_buffer("shifts", torch.cartesian_prod(along, along), persistent=False)  # (s, 2) pixels, down and to the right
-        n = len(self.shifts)
-        self.register_buffer("marks", torch.zeros(channels, 0), persistent=False)  # colours of the pixels by which places are told
-        self.register_buffer("index", torch.zeros(0, dtype=torch.long), persistent=False)  # where these are
-        self.register_buffer("around", torch.zeros(0, dtype=torch.long), persistent=False)  # pixels around them, at any place
-        self.register_buffer("weights", torch.zeros(0, n, 0), persistent=False)  # of these, for every place and mark
+        shifts = torch.cartesian_prod(along, along)  # (s, 2) pixels, down and to the right
+        pixels = torch.arange(-math.ceil(reach), math.ceil(reach) + 1)
+        around = torch.cartesian_prod(pixels, pixels)  # (w, 2), of which the pixel of any such place is mixed
+        mixing = (1.0 - (around[:, None] - shifts).abs()).clamp_min(0.0).prod(-1)  # bilinear: (w, s)
+        self.register_buffer("shifts", shifts, persistent=False)
+        self.register_buffer("mixing", mixing, persistent=False)
+        self.register_buffer("around", around, persistent=False)
+        self.register_buffer("marks", torch.zeros(channels, _MARKS, 1), persistent=False)  # colours of the pixels by which places are told
+        self.register_buffer("places", torch.zeros(_MARKS, len(around), dtype=torch.long), persistent=False)  # these, and around them
+        self.register_buffer("weights", torch.zeros(_MARKS), persistent=False)  # 1 for those that are distinct enough
         self._look()
 
     def _look(self) -> None:
-        """Takes from the background by which pixels :meth:`in_place` tells where the camera is."""
-        beside = self.background.flatten(1).median(1).values
-        off = (self.background - beside[:, None, None]).abs().amax(0).flatten()
-        rank = off.argsort(descending=True, stable=True)[:_MARKS]
-        index = rank[off[rank] > max(NOISE, WHOLE * float(off.amax()))]
+        """Takes from the background by which pixels :meth:`in_place` tells where the camera is; in place, as losses hold these tensors."""
+        colours = self.background.flatten(1)
+        off = (colours - colours.median(1, keepdim=True).values).abs().amax(0)
+        marks = off.argsort(descending=True, stable=True)[:_MARKS]
         size = self.background.shape[-1]
-        at = torch.stack([index // size, index % size], -1) + self.shifts[:, None]  # (s, k, 2)
-        pixels = torch.cartesian_prod(torch.arange(size), torch.arange(size)).to(at.device)
-        near = (1.0 - (pixels[:, None, None] - at.clamp(0, size - 1)).abs()).clamp_min(0.0).prod(-1)  # bilinear: (H W, s, k)
-        self.index, self.around = index, (near > 0).any(-1).any(-1).nonzero()[:, 0]
-        self.marks, self.weights = self.background.flatten(1)[:, index], near[self.around]
+        rows, columns = ((at[:, None] + by).clamp(0, size - 1) for at, by in zip((marks // size, marks % size), self.around.T, strict=True))
+        self.places.copy_(rows * size + columns)
+        self.marks.copy_(colours[:, marks, None])
+        self.weights.copy_(off[marks] > max(NOISE, WHOLE * float(off.amax())))
 
     def _load_from_state_dict(self, *arguments: Any) -> None:
         super()._load_from_state_dict(*arguments)
@@ -93,21 +97,22 @@ class Contrast(nn.Module):
 
     def without_glare(self, frames: Tensor) -> Tensor:
         """Frames ``(n, c, H, W)`` of a camera so bright that white is cut off, as what stands still shows them; others as they are."""
-        if not self.marks.shape[1]:
-            return frames
-        seen, known = frames.flatten(2)[:, :, self.index] + 1.0, self.marks + 1.0
-        gain = (seen * known).sum((1, 2), keepdim=True) / known.square().sum()
-        believed = (gain > _GLARE) & ((seen - gain * known).square().mean((1, 2), keepdim=True) < _LIKE)
-        gain = torch.where(believed, gain, 1.0)[..., None]
+        middle = self.places[:, self.places.shape[1] // 2, None]
+        seen, known = frames.flatten(2)[:, :, middle] + 1.0, self.marks + 1.0  # (n, c, k, 1) and (c, k, 1)
+        weighted = known * self.weights[:, None]
+        gain = (seen * weighted).sum((1, 2, 3)) / (known * weighted).sum().clamp_min(1e-9)
+        believed = (gain > _GLARE) & (self._apart(seen - gain[:, None, None, None] * known)[:, 0] < _LIKE)
+        gain = torch.where(believed, gain, 1.0)[:, None, None, None]
         cut = (frames > _WHITE) & ((self.background + 1.0) * gain > _WHITE + 1.0)
         return torch.where(cut, self.background, (frames + 1.0) / gain - 1.0)
 
+    def _apart(self, off: Tensor) -> Tensor:
+        """Mean square ``(n, s)`` of differences ``(n, c, k, s)`` at the marks; 0 where nothing is distinct."""
+        return (off.square().mean(1) * self.weights[:, None]).sum(1) / self.weights.sum().clamp_min(1.0)
+
     def in_place(self, frames: Tensor) -> Tensor:
         """Frames ``(n, c, H, W)`` as a camera that is in its place sees them."""
-        if not self.marks.shape[1]:
-            return frames  # nothing stands still
-        seen = (frames.flatten(2)[:, :, self.around] @ self.weights.flatten(1)).unflatten(2, self.weights.shape[1:])
-        apart = (seen - self.marks[:, None]).square().mean((1, 3))  # (n, s)
+        apart = self._apart(frames.flatten(2)[:, :, self.places] @ self.mixing - self.marks)
         still = len(self.shifts) // 2
         best = (apart + _SURE * (torch.arange(len(self.shifts), device=apart.device) != still)).argmin(1)
         if not (torch.compiler.is_compiling() or torch.compiler.is_exporting()) and bool((best == still).all()):
