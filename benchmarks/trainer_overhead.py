@@ -250,12 +250,12 @@ def bare_tighten(work: Workspace, asked: dict[str, Any]) -> Update:
         if loop.step % 100 == 0:  # the search is no mathematics of a loss: both sides make the same
             found = work.counterexamples = phase._search(work, rim)
             assert len(found), "nothing to train on"
-        z = found[loop.pick(len(found), s.batch)]
+        z = found[loop.pick(len(found), s.batch).square() // len(found)]
         after = still(dynamics, z, policy(z))
         after = after + steepest(barrier, after, s.tolerated_error)
         violation, short = (still(barrier, after) + 0.004).clamp_min(0.0), (0.01 - barrier(z)).clamp_min(0.0)
         given_up = violation.detach().clamp_max(0.05) / 0.05 * short
-        return total + 2.0 * (worst(given_up, 0.3, 0.02) + (0.3 * violation * (short.detach() > 0.0)).mean())
+        return total + 4.0 * (worst(given_up, 0.3, 0.02) + (0.3 * violation * (short.detach() > 0.0)).mean())
 
     return update
 
