@@ -85,6 +85,8 @@ def test_presets_mean_what_they_say():
     assert (sound.network.latent_dim, paper.network.latent_dim) == (5, 4)
     assert (paper.network.remember_action, paper.synthesis.choices, paper.synthesis.grid) == (False, 0, 0)
     assert compose(["env=pendulum", "preset=paper"]).network.latent_dim == 2
+    assert compose(["env=pendulum"]).network.encoder == "ContrastEncoder"
+    assert compose(["env=pendulum", "preset=paper"]).network.encoder == "FrameEncoder"
     own, quick = compose([]), compose(["preset=quick"])  # for systems of one's own
     assert smoke.trainer.total_frames < quick.trainer.total_frames < own.trainer.total_frames
     assert quick.evaluation.certificate_episodes >= 368  # of so many, none is at most 1 % with 97.5 % confidence
