@@ -84,10 +84,11 @@ def test_too_few_frames_are_named():
 def test_a_loss_that_is_loaded_puts_cameras_back_in_place(scene, encoder):
     _, pixels = scene
     shifted = CameraFault("shifted", 1.0, onset=0, seed=0)(pixels, 0)
-    losses = [SSPLLoss(build_encoder(encoder, latent_dim=3, image_size=64), LatentDynamics(3, 1), nn.Linear(3, 1), Policy(3, 1)) for _ in "ab"]
-    losses[0].encoder.module.fit(pixels[:, 3:])
+    encoders = [build_encoder(encoder, latent_dim=3, image_size=64) for _ in range(2)]
+    losses = [SSPLLoss(one, LatentDynamics(3, 1), nn.Linear(3, 1), Policy(3, 1)) for one in encoders]
+    encoders[0].fit(pixels[:, 3:])
     losses[1].load_state_dict(losses[0].state_dict())
     with torch.no_grad():
         seen, loaded = (loss._run("encoder", shifted) for loss in losses)
         assert torch.equal(seen, loaded)
-        assert torch.equal(seen, losses[0].encoder.module(shifted)), "the loss sees what its encoder sees"
+        assert torch.equal(seen, encoders[0](shifted)), "the loss sees what its encoder sees"

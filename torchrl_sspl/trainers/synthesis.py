@@ -353,11 +353,12 @@ class SteerPolicy(FineTune):
 class Tighten(FineTune):
     """Counterexamples of the proof go back into the fine-tuning until there are few left.
 
-    They are looked for near the data, in the whole domain and around those found before, anew every hundred steps.
-    Source: none (counterexample-guided synthesis); the paper asks the condition of its samples alone.
+    They are looked for near the data, in the whole domain and around those found before, anew every hundred steps; and climbed to from
+    the most promising of these. Source: none (counterexample-guided synthesis); the paper asks the condition of its samples alone.
     """
 
     name = "tighten"
+    samples, beside, penalty = 60_000, _INSIDE, 0.0  # drawn; barrier value up to which climbs begin, and what lying outside costs them
 
     def rates(self, work: Workspace) -> dict[nn.Module, float]:
         return {work.barrier: 0.5 * work.config.lr, work.policy: 0.5 * work.config.lr}
@@ -389,14 +390,15 @@ class Tighten(FineTune):
     @torch.no_grad()
     def _search(self, work: Workspace, rim: Tensor) -> Tensor:
         """The worst latents of the set, up to as many as are kept; those that are nearly counterexamples count, too."""
-        z = self._drawn(work, rim, 60_000)
-        z = z[work.barrier(z)[:, 0] <= _INSIDE]
+        z = self._drawn(work, rim, self.samples)
+        here = work.barrier(z)[:, 0]
+        z, here = z[here <= self.beside], here[here <= self.beside]
         if not len(z):
             return z
         after = work.dynamics(z, work.acting(z))
         value = work.barrier(after)[:, 0]
-        possible = value > self._least(work)
-        return self._climbed(work, z, after, possible, value)
+        possible = (value > self._least(work)) & (here <= _INSIDE)
+        return self._climbed(work, z, after, possible, value - self.penalty * here.clamp_min(0.0))
 
     @staticmethod
     def _drawn(work: Workspace, rim: Tensor, samples: int) -> Tensor:
@@ -449,8 +451,11 @@ class Settle(Tighten):
     """The smallest change after which no counterexample is found; for targets on a grid, which are nearly kept as they are fitted.
 
     Of the pictures of U those count that the barrier puts lowest, whatever action the memory holds, of S those that it puts highest.
-    Source: none (counterexample-guided synthesis).
+    Climbs begin beside the set, too: where it ends in a cusp, more samples lie there than in it. Source: none (counterexample-guided
+    synthesis).
     """
+
+    samples, beside, penalty = 30_000, _BESIDE, 3.0
 
     def run(self, work: Workspace) -> None:
         s, pick = work.config, work.loop.pick
@@ -491,20 +496,6 @@ class Settle(Tighten):
             return terms
 
         work.loop(self.size(work), self.rates(work), step)
-
-    @torch.no_grad()
-    def _search(self, work: Workspace, rim: Tensor) -> Tensor:
-        """Fewer samples, from the best of which the worst latents are climbed to: of cusps samples alone find none."""
-        z = self._drawn(work, rim, 30_000)
-        here = work.barrier(z)[:, 0]
-        z, here = z[here <= _BESIDE], here[here <= _BESIDE]
-        if not len(z):
-            return z
-        after = work.dynamics(z, work.acting(z))
-        value = work.barrier(after)[:, 0]
-        # Where the set ends in a cusp, more samples lie beside it than in it.
-        possible = (value > self._least(work)) & (here <= _INSIDE)
-        return self._climbed(work, z, after, possible, value - 3.0 * here.clamp_min(0.0))
 
 
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
