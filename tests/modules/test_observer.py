@@ -186,7 +186,7 @@ def test_without_a_memory_no_correction_may_be_larger_than_what_is_tolerated():
 
 def test_a_correction_that_would_leave_the_set_is_cut_to_what_is_tolerated():
     prior, wanted = torch.tensor([[0.4, 0.0]] * 3 + [[0.6, 0.0]]), torch.tensor([[0.9, 0.5], [0.45, 0.9], [0.55, 0.0], [0.9, 0.0]])
-    latent, cut = held(lambda z: z[:, :1] - 0.5, prior, wanted, 0.2)
+    latent, cut = held(lambda z: z[..., :1] - 0.5, prior, wanted, 0.2)
     # Led out far; moved far inside; led out by less than is tolerated; outside before.
     assert cut.tolist() == [True, False, False, False]
     assert torch.equal(latent[1:], wanted[1:])

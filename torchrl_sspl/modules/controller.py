@@ -185,9 +185,10 @@ class Controller:
         else:
             latent, innovation, _, seen = memory.correct(agent.encode(pixels.to(agent.gain.device)))
             rows = None
-        action, barrier = agent.policy(latent), agent.barrier(latent)[:, 0]
+        action = agent.policy(latent)
+        barrier, outer = agent.barrier(torch.stack([latent, seen]))[..., 0]
         error = (latent - (seen - innovation)).norm(dim=-1)
-        met = premise_met(barrier, agent.barrier(seen)[:, 0], error, agent.tolerated_error, held=memory.held_error > 0.0)
+        met = premise_met(barrier, outer, error, agent.tolerated_error, held=memory.held_error > 0.0)
         self._applies = self._applies & met
         memory.expect(agent.dynamics(latent, action), rows)
         self._last = latent, action.shape

@@ -105,7 +105,8 @@ def held(
         return latent, torch.zeros_like(latent[..., 0], dtype=torch.bool)
     moved = latent - prior
     length = moved.norm(dim=-1, keepdim=True)
-    leaves = (barrier(prior) <= 0.0) & (barrier(latent) > 0.0) & (length > error)
+    before, after = barrier(torch.stack([prior, latent]))
+    leaves = (before <= 0.0) & (after > 0.0) & (length > error)
     if not torch.compiler.is_compiling() and not bool(leaves.any()):
         return latent, leaves[..., 0]
     most = error if direction is None else direction.shortened(error)

@@ -21,7 +21,7 @@ MODES = ("nearest", "blend")
 LEVEL = -0.12
 UNPROVED_MARGIN = 0.02  # for an agent without a proof
 _GRID, _MOST = 81, 729  # actions per dimension that are tried, and in all
-_LINE, _HALVINGS = 16, 8  # actions on the way to the agent's own one, and halvings of what is left of the way
+_LINE, _ROUNDS = 16, 2  # actions that are tried on a way, and how often one of its parts is divided again
 
 
 @dataclass
@@ -44,8 +44,8 @@ class Shield:
         \qquad s' = \max(s, \min(B(d(\hat z, \pi(\hat z))) + \eta, 0))
 
     with :math:`\eta = L_B \delta + 2 \epsilon_B`, the error that the set is proved to tolerate and what the barrier's evaluation
-    may round off, and V a grid over all actions together with the way from u to :math:`\pi(\hat z)`; what is left of the way from u is
-    halved a few times. That :math:`\pi(\hat z)` keeps the set is what [V] says (Theorem G in ``docs/theory.md``), so nothing better
+    may round off, and V a grid over all actions together with the way from u to :math:`\pi(\hat z)`; the way from u to the nearest of
+    them is then searched in steps of 1/256. That :math:`\pi(\hat z)` keeps the set is what [V] says (Theorem G in ``docs/theory.md``), so nothing better
     than it is asked for: the agent's own actions are never changed. Source: none (least-restrictive filters of model-based control,
     on latents).
 
@@ -106,8 +106,7 @@ class Shield:
         taken, after = torch.where(keeps[:, None], asked, own), torch.where(keeps, after, after_own)
         rows = (inside & ~keeps).nonzero()[:, 0]
         if len(rows):
-            taken[rows] = self._near(latent[rows], asked[rows], own[rows], most[rows])
-            after[rows] = self._after(latent[rows], taken[rows])
+            taken[rows], after[rows] = self._near(latent[rows], asked[rows], own[rows], after_own[rows], most[rows])
         change = (taken - wanted) / scale
         return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self.level - self.margin - after)
 
@@ -115,24 +114,32 @@ class Shield:
         """``(n,)`` barrier values of successors."""
         return self.agent.barrier(self.agent.dynamics(latent, action))[:, 0]
 
-    def _near(self, latent: Tensor, asked: Tensor, own: Tensor, most: Tensor) -> Tensor:
-        """The nearest actions tried that keep the set; the agent's own ones where none does."""
-        n, m = asked.shape
+    def _near(self, latent: Tensor, asked: Tensor, own: Tensor, after_own: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest actions tried that keep the set, and the barrier after them; the agent's own ones where none does."""
         share = torch.linspace(0.0, 1.0, _LINE + 1, device=asked.device)[1:, None]
-        tried = asked[:, None] + share * (own - asked)[:, None]
+        tried = torch.lerp(asked[:, None], own[:, None], share)
         if self.mode == "nearest" and len(self.grid):
-            tried = torch.cat([tried, self.grid.to(asked).expand(n, -1, m)], 1)
-        k = tried.shape[1]
-        keeps = self._after(latent.repeat_interleave(k, 0), tried.reshape(-1, m)).reshape(n, k) <= most[:, None]
+            tried = torch.cat([tried, self.grid.to(asked).expand(len(asked), -1, -1)], 1)
+        each, after = torch.arange(len(asked), device=asked.device), self._after_each(latent, tried)
+        keeps = after <= most[:, None]
         distance = ((tried - asked[:, None]) / self.scale.to(asked)).norm(dim=-1).masked_fill(~keeps, float("inf"))
-        best = tried[torch.arange(n), distance.argmin(1)]
-        found = keeps.any(1, keepdim=True)
-        kept, lost = torch.ones(n, 1, device=asked.device), torch.zeros(n, 1, device=asked.device)
-        for _ in range(_HALVINGS):
-            middle = (kept + lost) / 2
-            good = (self._after(latent, torch.lerp(asked, best, middle)) <= most)[:, None]
-            kept, lost = torch.where(good, middle, kept), torch.where(good, lost, middle)
-        return torch.where(found, torch.where(kept < 1.0, torch.lerp(asked, best, kept), best), own)
+        best, found = distance.argmin(1), keeps.any(1)
+        kept, after, lost = torch.where(found[:, None], tried[each, best], own), torch.where(found, after[each, best], after_own), asked
+        for _ in range(_ROUNDS):
+            tried = torch.lerp(lost[:, None], kept[:, None], share)
+            then = self._after_each(latent, tried)
+            then[:, -1] = after  # known, and not to the last bit the same in another batch
+            keeps = then <= most[:, None]
+            keeps[:, -1] = True
+            first = keeps.int().argmax(1)
+            lost = torch.where((first > 0)[:, None], tried[each, first - 1], lost)
+            kept, after = tried[each, first], then[each, first]
+        return kept, after
+
+    def _after_each(self, latent: Tensor, actions: Tensor) -> Tensor:
+        """``(n, k)`` barrier values after actions ``(n, k, m)``."""
+        n, k, m = actions.shape
+        return self._after(latent.repeat_interleave(k, 0), actions.reshape(-1, m)).reshape(n, k)
 
 
 def _proved_margin(agent: Agent) -> float:
