@@ -133,6 +133,15 @@ def test_targets_rise_off_the_data_and_keep_the_sign_of_the_margin_on_it():
     assert float(away.min()) == pytest.approx(0.4, abs=1e-5)
 
 
+def test_values_between_latents_are_those_of_a_plane():
+    data, queries = (side * (2 * torch.rand(n, 2, generator=torch.Generator().manual_seed(n)) - 1) for n, side in ((4000, 1.0), (500, 0.9)))
+    slope = torch.tensor([1.0, -0.5])
+    off = (value_targets(queries, data, data @ slope, tube_radius=10.0, lipschitz_bound=1.0) + queries @ slope).abs()
+    assert float(off.mean()) < 1e-3  # the mean of three neighbours, the near ones counting more, is 0.0082 off
+    between = value_targets(queries, data, (data[:, 0] > 0).float(), tube_radius=1.0, lipschitz_bound=1.0)
+    assert -1.0 <= float(between.min()) and float(between.max()) <= 0.0  # a step is not overshot
+
+
 def test_values_need_a_row_for_every_latent():
     with pytest.raises(ShapeError, match="one row per latent"):
         safety_values(unstable(LINE), LINE, MARGIN)

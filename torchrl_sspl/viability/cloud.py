@@ -19,6 +19,11 @@ from torch import Tensor
 from torchrl_sspl.errors import EmptyRegionError, ShapeError
 
 
+_SMOOTHING = 0.02  # latent units, added to distances before they are inverted
+_RIDGE = 0.01  # of the spread of the neighbours, below which they tell no slope
+_PART = 100_000  # latents that are interpolated at a time
+
+
 def _tree(points: Tensor):
     # Imported here: scipy is a dependency, but importing the library stays light without it.
     from scipy.spatial import cKDTree
@@ -30,6 +35,35 @@ def _nearest(queries: Tensor, points: Tensor, count: int) -> tuple[Tensor, Tenso
     """Distances ``(n, count)`` float32 to the nearest points, and which these are."""
     distance, index = _tree(points).query(queries.detach().cpu().numpy(), k=range(1, count + 1))
     return torch.as_tensor(distance, dtype=torch.float32), torch.as_tensor(index)
+
+
+def _mixture(queries: Tensor, points: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
+    r"""Nearest points ``(n, count)``, weights of an interpolation between them, and the distance ``(n,)`` to the nearest.
+
+    The weights are those of a plane fitted to the values of the neighbours, near ones counting more: a mean of neighbours that lie
+    to one side of the query would say what is true over there, and a search for the best of many actions finds just those errors.
+    """
+    distance, index = _nearest(queries, points, count)
+    parts = zip(queries.split(_PART), distance.split(_PART), index.split(_PART), strict=True)
+    return index, torch.cat([_plane_weights(points[rows] - q[:, None], d) for q, d, rows in parts]), distance[:, 0]
+
+
+def _plane_weights(off: Tensor, distance: Tensor) -> Tensor:
+    """Weights ``(n, k)`` of neighbours at offsets ``(n, k, p)``."""
+    weight = 1.0 / (distance + _SMOOTHING)
+    weight = weight / weight.sum(1, keepdim=True)
+    centre = (weight[..., None] * off).sum(1)
+    off = off - centre[:, None]
+    spread = off.mT @ (weight[..., None] * off)
+    ridge = _RIDGE * spread.diagonal(dim1=1, dim2=2).sum(1) + 1e-9  # across the data nothing is known of a slope
+    tilt = torch.linalg.solve(spread + ridge[:, None, None] * torch.eye(off.shape[2]), centre)
+    return weight * (1.0 - (off @ tilt[..., None])[..., 0])
+
+
+def _mixed(value: Tensor, index: Tensor, weight: Tensor) -> Tensor:
+    """Interpolated values, within those of the neighbours."""
+    around = value[index]
+    return (around * weight).sum(-1).clamp(around.amin(-1), around.amax(-1))
 
 
 def nearest_distance(queries: Tensor, points: Tensor) -> Tensor:
@@ -274,15 +308,14 @@ def safety_values(
     margin: Tensor,
     *,
     residuals: Tensor | None = None,
-    neighbours: int = 3,
-    smoothing: float = 0.02,
+    neighbours: int = 8,
     horizon: int = 60,
 ) -> Tensor:
     r"""Least margin ``(n, k)`` that an action leaves on all that follows, whatever the error among the given ones.
 
     .. math:: Q(z_i, u) = \min_e \overline V(d(z_i, u) + e), \qquad V(z_i) = \min(m_i, \max_u Q(z_i, u))
 
-    with :math:`\overline V` the mean over the nearest latents, weighted by the inverse of their distance. Unlike the
+    with :math:`\overline V` interpolated linearly between the nearest latents. Unlike the
     clearance of one step it tells actions apart long before the border of what can be kept is reached. Source: none
     (the paper trains its policy on the condition alone); it is Hamilton-Jacobi reachability on a cloud of latents.
 
@@ -291,8 +324,7 @@ def safety_values(
         latent: ``(n, p)`` latents; sizes that differ are a ShapeError.
         margin: ``(n,)`` how far a latent is from what it must not become; negative there.
         residuals: ``(n, j, p)`` observed errors of the dynamics near every latent; none if not given.
-        neighbours: latents over which the value of a successor is averaged.
-        smoothing: distance that is added to distances before they are inverted.
+        neighbours: latents between which the value of a successor is interpolated.
         horizon: steps looked ahead.
 
     Example:
@@ -310,12 +342,10 @@ def safety_values(
         )
     errors = torch.zeros(n, 1, p) if residuals is None else residuals
     ends = (successors[:, :, None] + errors[:, None]).reshape(-1, p)
-    distance, found = _nearest(ends, latent, neighbours)
-    index, weight = (t.reshape(n, k, -1, neighbours) for t in (found, 1.0 / (distance + smoothing)))
-    weight = weight / weight.sum(-1, keepdim=True)
+    index, weight = (found.reshape(n, k, -1, neighbours) for found in _mixture(ends, latent, neighbours)[:2])
     value = margin
     for _ in range(horizon):
-        per_action = (value[index] * weight).sum(-1).amin(-1)
+        per_action = _mixed(value, index, weight).amin(-1)
         best = torch.minimum(margin, per_action.amax(1))
         change, value = float((best - value).abs().max()), best
         if change < 1e-3:
@@ -349,8 +379,7 @@ def value_targets(
     *,
     tube_radius: float,
     lipschitz_bound: float,
-    neighbours: int = 3,
-    smoothing: float = 0.02,
+    neighbours: int = 8,
 ) -> Tensor:
     r"""Target ``(n,)`` of the barrier at any latent: minus the margin that a policy keeps, rising off the data.
 
@@ -363,7 +392,7 @@ def value_targets(
     Args:
         queries: ``(n, p)`` latents.
         latent: ``(m, p)`` latents of the data.
-        value: ``(m,)`` margins V, see :func:`safety_values`, for ``neighbours`` and ``smoothing`` too.
+        value: ``(m,)`` margins V, see :func:`safety_values`, for ``neighbours`` too.
         tube_radius: distance r from the data up to which a latent may belong to the set.
         lipschitz_bound: Lipschitz bound of the barrier.
 
@@ -372,7 +401,5 @@ def value_targets(
         >>> value_targets(torch.tensor([[0.0], [0.5]]), data, value, tube_radius=0.3, lipschitz_bound=1.0, neighbours=1)
         tensor([-0.2000,  0.2000])
     """
-    distance, found = _nearest(queries, latent, neighbours)
-    weight = 1.0 / (distance + smoothing)
-    mean = (value[found] * weight).sum(-1) / weight.sum(-1)
-    return torch.maximum(-mean, lipschitz_bound * (distance[:, 0] - tube_radius))
+    index, weight, distance = _mixture(queries, latent, neighbours)
+    return torch.maximum(-_mixed(value, index, weight), lipschitz_bound * (distance - tube_radius))
