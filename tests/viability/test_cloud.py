@@ -133,6 +133,12 @@ def test_targets_rise_off_the_data_and_keep_the_sign_of_the_margin_on_it():
     assert float(away.min()) == pytest.approx(0.4, abs=1e-5)
 
 
+def test_a_way_is_worth_its_narrowest_place():
+    chain, margin = torch.tensor([[0.0], [1.0], [2.0]]), torch.tensor([0.3, 0.1, 0.5])
+    value = safety_values(chain[[1, 2, 2]][:, None], chain, margin, neighbours=1)
+    torch.testing.assert_close(value[:, 0], torch.tensor([0.1, 0.5, 0.5]))
+
+
 def test_values_between_latents_are_those_of_a_plane():
     data, queries = (side * (2 * torch.rand(n, 2, generator=torch.Generator().manual_seed(n)) - 1) for n, side in ((4000, 1.0), (500, 0.9)))
     slope = torch.tensor([1.0, -0.5])
