@@ -18,7 +18,6 @@ from torch import Tensor
 
 from torchrl_sspl.errors import EmptyRegionError, ShapeError
 
-
 _SMOOTHING = 0.02  # latent units, added to distances before they are inverted
 _RIDGE = 0.01  # of the spread of the neighbours, below which they tell no slope
 _PART = 100_000  # latents that are interpolated at a time
