@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
 from torch import Tensor
 
+from torchrl_sspl.envs import CMUDubinsEnv
 from torchrl_sspl.errors import EmptyRegionError, ShapeError
+from torchrl_sspl.viability import viability_kernel
 from torchrl_sspl.viability.cloud import (
     barrier_targets,
     nearby_residuals,
@@ -147,6 +151,20 @@ def test_values_between_latents_are_those_of_a_plane():
     between = value_targets(queries, data, (data[:, 0] > 0).float(), tube_radius=1.0, lipschitz_bound=1.0)
     assert float(between.min()) >= -1.0  # a step is not overshot
     assert float(between.max()) <= 0.0
+
+
+def test_values_on_a_cloud_are_the_kernel_of_a_car_that_is_known_exactly():
+    env, random = CMUDubinsEnv(batch_size=[1], seed=0), torch.Generator().manual_seed(0)
+    kernel = viability_kernel(env, resolution=(51, 51, 40))
+    states, queries = (torch.tensor([1.1, 1.1, math.pi]) * (2 * torch.rand(n, 3, generator=random) - 1) for n in (10_000, 4000))
+    latent = lambda x: torch.cat([x[..., :2] / 1.3, 0.4 * x[..., 2:].cos(), 0.4 * x[..., 2:].sin()], -1)  # noqa: E731
+    after = torch.stack([env.dynamics(states, torch.full((len(states), 1), rate)) for rate in (-1.25, 0.0, 1.25)], 1)
+    margin = signed_margin(latent(states), env.region(states)[:, 0] == 2)
+    value = safety_values(latent(after), latent(states), margin).amax(1).minimum(margin)
+    called = value_targets(latent(queries), latent(states), value, tube_radius=1.0, lipschitz_bound=1.0) <= 0.0
+    safe = kernel.contains(queries)
+    assert float(called[safe].float().mean()) > 0.98
+    assert float(called[~safe].float().mean()) < 0.05  # with means of three neighbours 0.18, of eight 0.06
 
 
 def test_values_need_a_row_for_every_latent():
