@@ -167,6 +167,13 @@ def test_values_on_a_cloud_are_the_kernel_of_a_car_that_is_known_exactly():
     assert float(called[~safe].float().mean()) < 0.05  # with means of three neighbours 0.18, of eight 0.06
 
 
+def test_a_cloud_may_have_fewer_latents_than_neighbours():
+    few = torch.tensor([[0.0], [1.0]])
+    assert safety_values(few[:, None], few, torch.tensor([0.2, 0.1])).shape == (2, 1)
+    target = value_targets(few, few, torch.tensor([0.2, 0.1]), tube_radius=1.0, lipschitz_bound=1.0)
+    assert bool(((target >= -0.2) & (target <= -0.1)).all())
+
+
 def test_values_need_a_row_for_every_latent():
     with pytest.raises(ShapeError, match="one row per latent"):
         safety_values(unstable(LINE), LINE, MARGIN)

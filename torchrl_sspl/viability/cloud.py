@@ -37,12 +37,12 @@ def _nearest(queries: Tensor, points: Tensor, count: int) -> tuple[Tensor, Tenso
 
 
 def _mixture(queries: Tensor, points: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    r"""Nearest points ``(n, count)``, weights of an interpolation between them, and the distance ``(n,)`` to the nearest.
+    """Nearest points ``(n, count)``, fewer where there are fewer, weights of an interpolation between them, and the distance ``(n,)`` to the nearest.
 
     The weights are those of a plane fitted to the values of the neighbours, near ones counting more: a mean of neighbours that lie
     to one side of the query would say what is true over there, and a search for the best of many actions finds just those errors.
     """
-    distance, index = _nearest(queries, points, count)
+    distance, index = _nearest(queries, points, min(count, len(points)))
     parts = zip(queries.split(_PART), distance.split(_PART), index.split(_PART), strict=True)
     return index, torch.cat([_plane_weights(points[rows] - q[:, None], d) for q, d, rows in parts]), distance[:, 0]
 
@@ -341,7 +341,7 @@ def safety_values(
         )
     errors = torch.zeros(n, 1, p) if residuals is None else residuals
     ends = (successors[:, :, None] + errors[:, None]).reshape(-1, p)
-    index, weight = (found.reshape(n, k, -1, neighbours) for found in _mixture(ends, latent, neighbours)[:2])
+    index, weight = (found.reshape(n, k, errors.shape[1], -1) for found in _mixture(ends, latent, neighbours)[:2])
     value = margin
     for _ in range(horizon):
         per_action = _mixed(value, index, weight).amin(-1)
