@@ -186,9 +186,9 @@ class Controller:
             latent, innovation, _, seen = memory.correct(agent.encode(pixels.to(agent.gain.device)))
             rows = None
         action = agent.policy(latent)
-        barrier, outer = agent.barrier(torch.stack([latent, seen]))[..., 0]
+        barrier, of_seen = agent.barrier(torch.stack([latent, seen]))[..., 0]
         error = (latent - (seen - innovation)).norm(dim=-1)
-        met = premise_met(barrier, outer, error, agent.tolerated_error, held=memory.held_error > 0.0)
+        met = premise_met(barrier, of_seen, error, agent.tolerated_error, held=memory.held_error > 0.0)
         self._applies = self._applies & met
         memory.expect(agent.dynamics(latent, action), rows)
         self._last = latent, action.shape

@@ -89,7 +89,7 @@ def held(
     (in filtering, the projection of a constrained estimate).
 
     Args:
-        barrier: latent -> barrier value ``(*batch, 1)``, at most zero means inside.
+        barrier: latent ``(..., p)`` -> barrier value ``(..., 1)``, at most zero means inside; asked once, of both, ``(2, *batch, p)``.
         prior, latent: before and after the correction, ``(*batch, p)``.
         error: :math:`\delta`, latent units; 0: nothing is cut.
         direction: what is cut goes back onto its circle, and is cut so much more that it is not farther away then.

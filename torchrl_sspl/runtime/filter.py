@@ -45,9 +45,9 @@ class Shield:
 
     with :math:`\eta = L_B \delta + 2 \epsilon_B`, the error that the set is proved to tolerate and what the barrier's evaluation
     may round off, and V a grid over all actions together with the way from u to :math:`\pi(\hat z)`; the way from u to the nearest of
-    them is then searched in steps of 1/256. That :math:`\pi(\hat z)` keeps the set is what [V] says (Theorem G in ``docs/theory.md``), so nothing better
-    than it is asked for: the agent's own actions are never changed. Source: none (least-restrictive filters of model-based control,
-    on latents).
+    them is then searched to 1/256 of it. That :math:`\pi(\hat z)` keeps the set is what [V] says (Theorem G in ``docs/theory.md``), so
+    nothing better than it is asked for: the agent's own actions are never changed. Source: none (least-restrictive filters of
+    model-based control, on latents).
 
     Args:
         agent: frozen agent with a tolerated error, so that [V] is proved.
