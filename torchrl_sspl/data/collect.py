@@ -321,6 +321,10 @@ def _end(collector: weakref.ref[BaseCollector]) -> None:
     if (alive := collector()) is not None:
         with contextlib.suppress(Exception):
             alive.shutdown()
+        # Its queues tell the workers to stop, by a thread that each begins: once Python collects what is left, no thread can begin.
+        for scheme in (getattr(alive, "_weight_sync_schemes", None) or {}).values():
+            with contextlib.suppress(Exception):
+                scheme.shutdown()
 
 
 def _ray_collector(makers: list[Any], policy: TensorDictModuleBase, address: str, options: dict[str, Any]) -> BaseCollector:
