@@ -5,7 +5,7 @@ Run: python benchmarks/few_labels.py [env=pendulum] [labels=100,300,1000,all] [t
 
 Every point is a training of its own, with the recommended settings, one round and no rollouts; a point that has been measured is read.
 Of ``transitions``, recorded under random actions with 15 % of the episodes starting in S and 25 % in U, at most ``labels`` of each
-kind are labelled, those that come first; the rest is unlabelled. The level of the set is placed by held-out episodes with labels of their
+kind are labelled, those that come first; the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. The level of the set is placed by held-out episodes with labels of their
 own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``.
 """
 
@@ -70,7 +70,7 @@ class Point:
 
 def table(rows: list[dict[str, Any]]) -> str:
     """One line for each point: means over the seeds, worst in brackets."""
-    head = ["env", "labels of S", "labels of U", "transitions", "wrong", "seeds", "passed the checks", *(c for c, _ in COLUMNS)]
+    head = ["env", "labels of S", "labels of U", "of neither", "transitions", "wrong", "seeds", "passed the checks", *(c for c, _ in COLUMNS)]
     lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
 
     def of(row: dict[str, Any]) -> tuple[Any, ...]:
@@ -84,7 +84,7 @@ def table(rows: list[dict[str, Any]]) -> str:
             worst = (min if name == "claimed_over_kernel" else max)(values, default=0.0)
             mean = f"{100 * sum(values) / len(values):.1f} %" if values else "-"
             cells.append(mean if len(values) < 2 else f"{mean} ({100 * worst:.1f} %)")
-        needs = [str(first["needs"][k]) for k in ("safe_labels", "unsafe_labels", "transitions")]
+        needs = [str(first["needs"][k]) for k in ("safe_labels", "unsafe_labels", "neither_labels", "transitions")]
         seeds, passed = ", ".join(str(r["seed"]) for r in found), f"{sum(r['passed'] for r in found):.0f} of {len(found)}"
         lines.append(f"| {' | '.join([first['env'], *needs, str(first['wrong']), seeds, passed, *cells])} |")
     return "\n".join(lines)

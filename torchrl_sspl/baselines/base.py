@@ -62,7 +62,7 @@ class Needs:
 
     Attributes:
         transitions: pictures with the action that followed.
-        safe_labels, unsafe_labels: pictures that were labelled as of S, or of U.
+        safe_labels, unsafe_labels, neither_labels: pictures that were labelled as of S, as of U, or as of neither where that was asked.
         states: pictures that came with their true state (pose and speed).
         masks: pictures that came with the place of things in them (obstacle, robot).
         expert_actions: actions of an expert that knows state and dynamics.
@@ -81,6 +81,7 @@ class Needs:
     transitions: int = 0
     safe_labels: int = 0
     unsafe_labels: int = 0
+    neither_labels: int = 0
     states: int = 0
     masks: int = 0
     expert_actions: int = 0

@@ -122,11 +122,12 @@ class AugmentationConfig:
 
 @dataclass
 class LabelsConfig:
-    """Which of the labels that the environment gives are used in the training, those that come first; held-out checks have their own."""
+    """Which of the labels that the environment gives are used in the training; held-out checks have their own."""
 
-    safe: int | None = _option(None, "labels of S at most, everything else is unlabelled; null: all.")
+    safe: int | None = _option(None, "labels of S at most, those that come first; everything else is unlabelled; null: all.")
     unsafe: int | None = _option(None, "the same of U.")
     wrong: float = _option(0.0, "chance that a label is the other one.")
+    choose: int = _option(0, "further pictures that are labelled, of S, of U or of neither: those of which the latents tell least.")
 
 
 @dataclass
@@ -338,6 +339,8 @@ class Config:
                 f"expected collector.init_random_frames of at most trainer.total_frames={self.trainer.total_frames}, received "
                 f"{c.init_random_frames}: nothing would be learnt"
             )
+        if self.labels.choose and not self.synthesis.enabled:
+            raise ConfigError(f"expected labels.choose=0 with synthesis.enabled=false, received {self.labels.choose}: pictures are chosen on its latents")
         if self.synthesis.rounds < 1:
             raise ConfigError(f"expected synthesis.rounds >= 1, received {self.synthesis.rounds}; synthesis.enabled=false for none")
         return self

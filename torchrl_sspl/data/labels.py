@@ -21,19 +21,26 @@ class Labels:
     Args:
         safe, unsafe: labels of S and of U, at most; None: all.
         wrong: chance that a label is the other one, in [0, 1].
+        choose: pictures that are labelled beside them once there are latents to choose them by, see
+            :func:`~torchrl_sspl.trainers.choose_and_spread`. These may be of neither set.
         seed: of which are wrong.
 
-    Raises ConfigError for other values.
+    Raises ConfigError for other values, or if pictures are to be chosen where all are labelled.
 
     Example:
         >>> Labels(safe=1)(torch.tensor([[1], [2], [1], [0]])).flatten().tolist()
         [1, 2, 0, 0]
     """
 
-    def __init__(self, *, safe: int | None = None, unsafe: int | None = None, wrong: float = 0.0, seed: int = 0) -> None:
+    def __init__(self, *, safe: int | None = None, unsafe: int | None = None, wrong: float = 0.0, choose: int = 0, seed: int = 0) -> None:
         if any(n is not None and n < 0 for n in (safe, unsafe)) or not 0.0 <= wrong <= 1.0:
             raise ConfigError(f"labels: expected safe and unsafe >= 0 or None, and wrong in [0, 1], received {safe!r}, {unsafe!r}, {wrong!r}")
-        self.most, self.wrong, self.seed = {SAFE: safe, UNSAFE: unsafe}, float(wrong), seed
+        if choose < 0 or (choose and None in (safe, unsafe)):
+            raise ConfigError(
+                f"labels: expected choose >= 0, and limits of both kinds where pictures are to be chosen, received choose={choose!r} with "
+                f"safe={safe!r}, unsafe={unsafe!r}; give labels.safe and labels.unsafe, such as 100 each"
+            )
+        self.most, self.wrong, self.choose, self.seed = {SAFE: safe, UNSAFE: unsafe}, float(wrong), choose, seed
 
     def less(self, safe: int, unsafe: int, *, seed: int) -> Labels:
         """What is left of them when so many have been used; other ones are wrong."""
@@ -47,6 +54,16 @@ class Labels:
 
         Raises ShapeError for another shape.
         """
+        found = self.answers(region, position)
+        for code, most in self.most.items():
+            if most is not None:
+                mine = found == code
+                before = 0 if held is None else int((held == code).sum())
+                found[mine & (mine.cumsum(0) + before > most)] = UNLABELLED
+        return found
+
+    def answers(self, region: Tensor, position: int = 0) -> Tensor:
+        """What is said of every picture ``(n, 1)`` that is asked for, some of it wrong; a ShapeError for another shape."""
         if region.ndim != 2 or region.shape[1] != 1:
             raise ShapeError(f"labels: expected (n, 1), received {tuple(region.shape)}")
         found = region.clone()
@@ -54,11 +71,6 @@ class Labels:
             draw = torch.Generator().manual_seed(spawn(self.seed, "labels", position))
             mistaken = (torch.rand(region.shape, generator=draw) < self.wrong) & (region != UNLABELLED)
             found = torch.where(mistaken, SAFE + UNSAFE - found, found)
-        for code, most in self.most.items():
-            if most is not None:
-                mine = found == code
-                before = 0 if held is None else int((held == code).sum())
-                found[mine & (mine.cumsum(0) + before > most)] = UNLABELLED
         return found
 
 

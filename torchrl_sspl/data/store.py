@@ -136,6 +136,8 @@ class TransitionStore(Storage):
         if self.labels is not None:
             stays = torch.ones(self._len, dtype=torch.bool)
             stays[index[index < self._len]] = False
+            if self.labels.choose:  # which of the others are asked for is decided later, on latents
+                columns["answer"] = self.labels.answers(columns["region"], int(index[0]))
             columns["region"] = self.labels(columns["region"], self.region[stays], int(index[0]))
             columns["next_region"] = torch.zeros_like(columns["next_region"])
         if set_cursor:
@@ -206,6 +208,8 @@ class TransitionStore(Storage):
         )
         if self.pixel_views:
             out["pixels"], out["next", "pixels"] = frames[:, :2].flatten(1, 2), frames[:, 1:].flatten(1, 2)
+        if "answer" in column:
+            out["answer"] = column["answer"]
         if self.keep_state:
             out["info"] = TensorDict(
                 {"state": column["state"], "next_state": column["next_state"]}, batch_size=[rows.numel()]

@@ -6,6 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what readers of the source, type checkers among them, need to know
+    from torchrl_sspl.trainers.asking import choose_and_spread
     from torchrl_sspl.trainers.phases import Check, InnerLoop, Phase, Phases, Workspace
     from torchrl_sspl.trainers.selection import CheckRound, PlaceLevel
     from torchrl_sspl.trainers.source import Source, starts_of
@@ -23,6 +24,7 @@ if TYPE_CHECKING:  # what readers of the source, type checkers among them, need 
     from torchrl_sspl.trainers.trainer import SSPLTrainer
 
 _NAMES = {
+    "choose_and_spread": "asking",
     **dict.fromkeys(("Check", "InnerLoop", "Phase", "Phases", "Workspace"), "phases"),
     **dict.fromkeys(("CheckRound", "PlaceLevel"), "selection"),
     **dict.fromkeys(("Source", "starts_of"), "source"),
@@ -34,7 +36,8 @@ _NAMES = {
 }
 __all__ = [
     "Check", "CheckRound", "FineTune", "FitDynamics", "FitSets", "Gather", "InnerLoop", "Phase", "Phases", "PlaceLevel",
-    "SSPLTrainer", "Settle", "Source", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "starts_of", "synthesis_phases",
+    "SSPLTrainer", "Settle", "Source", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "choose_and_spread", "starts_of",
+    "synthesis_phases",
 ]  # fmt: skip
 
 

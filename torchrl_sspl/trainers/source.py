@@ -108,6 +108,11 @@ class Source:
         self.budget["labels of U"] += int((region == UNSAFE).sum())
         self.budget["resets"] += (store.n_frames - n) // 2  # an episode has two frames more than transitions
 
+    def count_labels(self, answers: Tensor) -> None:
+        """Adds labels ``(n,)`` that were asked for to the budget, with those that say that a picture is of neither set."""
+        for code, name in ((SAFE, "labels of S"), (UNSAFE, "labels of U"), (UNLABELLED, "labels of neither")):
+            self.budget[name] = self.budget.get(name, 0) + int((answers == code).sum())
+
     def stored(self, most: int) -> Latents | None:
         """Latents of the joint training's transitions; of more than ``most``, those of S and U first, up to half, and
         others at random. ``None`` without a store."""
@@ -201,16 +206,18 @@ class Source:
         """Encoded observations before and after, actions and regions of some transitions, on the CPU; which of them go on
         where the one before ends."""
         device = next(self.encoder.parameters()).device
-        parts = []
+        parts, asked = [], ["answer"] if self.labels is not None and self.labels.choose else []
         for rows in index.split(_ENCODED):
             batch = store.get(rows)
             if hasattr(self.encoder, "sequence"):
                 latent, after = self.encoder.sequence(batch["frames"].to(device)).unbind(1)  # type: ignore[operator]
             else:
                 latent, after = self.encoder(batch["pixels"].to(device)), self.encoder(batch["next", "pixels"].to(device))
-            parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"]))
-        names = ("seen", "next_seen", "action", "region")
+            parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"], *(batch[k] for k in asked)))
+        names = ("seen", "next_seen", "action", "region", *asked)
         found = {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
+        if asked:
+            found["told"] = found["region"] != UNLABELLED
         neighbours = torch.cat([torch.zeros(1, dtype=torch.bool), index[1:] == index[:-1] + 1])
         return found | {"continues": continues(store, index) & neighbours}
 

@@ -35,6 +35,7 @@ from torchrl_sspl.objectives import (
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
+from torchrl_sspl.trainers.asking import choose_and_spread
 from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
 from torchrl_sspl.trainers.targets import observed_errors, off_manifold, remembered, successors, targets, uniform
 from torchrl_sspl.viability.cloud import (
@@ -90,6 +91,8 @@ class Gather(Phase):
                 parts.append(_rim_of_unsafe(work, 20 * self.number + 10))
         parts = [work.filtered(part) for part in parts]
         work.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
+        if source.labels is not None and source.labels.choose:
+            self._choose(work)
         work.cache.clear()
         unsafe = work.unsafe()
         if not bool(unsafe.any()) or bool(unsafe.all()):
@@ -98,6 +101,14 @@ class Gather(Phase):
                 "U, and what follows needs both kinds"
             )
             work.skip = True
+
+    def _choose(self, work: Workspace) -> None:
+        """Asks for labels in the first round, and spreads those that are known."""
+        data, source = work.latents, work.source
+        region, told, answer = (data[k][:, 0] for k in ("region", "told", "answer"))
+        count = 0 if self.number else source.labels.choose
+        data["region"], data["told"] = (x[:, None] for x in choose_and_spread(data["seen"][:, : work.seen_dim], region, told, answer, count))
+        source.count_labels(answer[data["told"][:, 0] & ~told])
 
     def _near_the_set(self, work: Workspace) -> dict[str, Tensor]:
         s, source = work.config, work.source

@@ -1,0 +1,92 @@
+"""Which pictures a person is asked about, and what the answers say of the others."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from torchrl_sspl.configs import compose
+from torchrl_sspl.data import Labels
+from torchrl_sspl.errors import ConfigError, EmptyRegionError
+from torchrl_sspl.experiments import Experiment
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+from torchrl_sspl.trainers import choose_and_spread
+
+
+def box(n: int = 6000) -> tuple[torch.Tensor, torch.Tensor]:
+    """Latents of a plane, and their answers: U around a box, S in its middle."""
+    z = torch.rand(n, 2, generator=torch.Generator().manual_seed(0)) * 2 - 1
+    far = z.abs().amax(1)
+    answer = torch.full((n,), UNLABELLED)
+    answer[far < 0.1] = SAFE
+    answer[far > 0.6] = UNSAFE
+    return z, answer
+
+
+def first(answer: torch.Tensor, count: int) -> torch.Tensor:
+    """The first labels of S and of U."""
+    told = torch.zeros(len(answer), dtype=torch.bool)
+    for code in (SAFE, UNSAFE):
+        told[(answer == code).nonzero()[:count, 0]] = True
+    return told
+
+
+def test_chosen_labels_tell_where_u_ends_better_than_as_many_random_ones():
+    z, answer = box()
+    region, told = choose_and_spread(z, answer * first(answer, 20), first(answer, 20), answer, 160)
+    assert int(told.sum()) == 200
+    random = torch.arange(len(z)) < 200
+    plain, still = choose_and_spread(z, answer * random, random, answer, 0)
+    assert torch.equal(still, random)
+
+    def wrong(found: torch.Tensor) -> float:
+        return float(((found == UNSAFE) != (answer == UNSAFE)).float().mean())
+
+    assert wrong(region) < 0.025
+    assert wrong(plain) > 2 * wrong(region)
+    assert int(((region != UNSAFE) & (answer == UNSAFE)).sum()) < int(((region == UNSAFE) & (answer != UNSAFE)).sum())  # caution
+
+
+def test_only_labels_say_s_and_no_answer_is_read_that_was_not_asked_for():
+    z, answer = box()
+    start = first(answer, 20)
+    region, told = choose_and_spread(z, answer * start, start, answer, 100)
+    assert torch.equal(region == SAFE, told & (answer == SAFE))
+    assert (told & start == start).all()
+    secret = torch.where(told, answer, UNSAFE)
+    again = choose_and_spread(z, answer * start, start, secret, 100)
+    assert torch.equal(again[0], region)
+    assert torch.equal(again[1], told)
+    # Later rounds ask for nothing, and know what was answered.
+    assert torch.equal(choose_and_spread(z, region, told, torch.zeros_like(answer), 0)[0], region)
+    rows = torch.cat([start.nonzero()[:, 0], torch.arange(5)])
+    assert choose_and_spread(z[rows], answer[rows] * start[rows], start[rows], answer[rows], 100)[1].all()
+
+
+@pytest.mark.parametrize("codes", [[UNSAFE, UNSAFE], [SAFE, SAFE]])
+def test_labels_of_one_side_alone_are_refused(codes):
+    told = torch.ones(2, dtype=torch.bool)
+    with pytest.raises(EmptyRegionError, match="labels of U and of what is not of U"):
+        choose_and_spread(torch.rand(2, 2), torch.tensor(codes), told, torch.tensor(codes), 0)
+
+
+def test_a_run_asks_for_as_many_labels_as_it_may(tmp_path):
+    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false"]
+    run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11", "labels.choose=30"]))
+    run.train()
+    budget, latents = run.work.source.budget, run.work.latents
+    assert budget["labels of S"] + budget["labels of U"] + budget["labels of neither"] == 9 + 11 + 30
+    assert budget["labels of neither"] > 0
+    assert int(latents["told"].sum()) == 50
+    assert int((latents["region"] == UNSAFE).sum()) > 5 * budget["labels of U"]
+
+
+@pytest.mark.parametrize("options", [{"choose": 5}, {"choose": 5, "safe": 3}, {"choose": -1, "safe": 3, "unsafe": 3}])
+def test_choosing_needs_limits(options):
+    with pytest.raises(ConfigError, match="labels: expected choose"):
+        Labels(**options)
+
+
+def test_choosing_needs_latents():
+    with pytest.raises(ConfigError, match=r"labels\.choose=0 with synthesis\.enabled=false"):
+        compose(["env=pendulum", "labels.safe=9", "labels.unsafe=9", "labels.choose=5", "synthesis.enabled=false"]).check()
