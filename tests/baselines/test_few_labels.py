@@ -26,7 +26,7 @@ def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, 
 
     assert "| 20 | 20 |" not in run("run=false")
     printed = run()
-    assert "| pendulum | 20 | 20 | 1280 | 0.05 | 0 |" in printed
+    assert "| pendulum | 20 | 20 | 0 | 1280 | 0.05 | 0 |" in printed
     found = json.loads((tmp_path / "points.json").read_text())
     assert [row["labels"] for row in found] == ["20", "all"]
     assert found[1]["needs"]["safe_labels"] > 100

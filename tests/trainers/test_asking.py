@@ -59,8 +59,9 @@ def test_only_labels_say_s_and_no_answer_is_read_that_was_not_asked_for():
     assert torch.equal(again[1], told)
     # Later rounds ask for nothing, and know what was answered.
     assert torch.equal(choose_and_spread(z, region, told, torch.zeros_like(answer), 0)[0], region)
-    rows = torch.cat([start.nonzero()[:, 0], torch.arange(5)])
-    assert choose_and_spread(z[rows], answer[rows] * start[rows], start[rows], answer[rows], 100)[1].all()
+    known = start.nonzero()[:, 0]
+    rows, start = torch.cat([known, torch.arange(5), known]), torch.cat([start[known], start[:5], torch.zeros(len(known), dtype=torch.bool)])
+    assert choose_and_spread(z[rows], answer[rows] * start, start, answer[rows], 100)[1].all()  # those that look the same, too
 
 
 @pytest.mark.parametrize("codes", [[UNSAFE, UNSAFE], [SAFE, SAFE]])

@@ -51,7 +51,7 @@ def choose_and_spread(seen: Tensor, region: Tensor, told: Tensor, answer: Tensor
             "labels.unsafe"
         )
     to_unsafe, to_rest = (nearest_distance(seen, seen[side]) for side in sides)
-    for _ in range(min(count, int((~told).sum()))):  # one after the other: each answer tells what to ask next
+    for _ in range(count):  # one after the other: each answer tells what to ask next
         near, far = torch.minimum(to_unsafe, to_rest), torch.maximum(to_unsafe, to_rest)
         row = (near * (near / far.clamp_min(1e-9)).pow(_DOUBT)).masked_fill(told, -1.0).argmax()
         told[row], side = True, to_unsafe if unsafe[row] else to_rest
