@@ -42,9 +42,17 @@ def test_chosen_labels_tell_where_u_ends_better_than_as_many_random_ones():
     def wrong(found: torch.Tensor) -> float:
         return float(((found == UNSAFE) != (answer == UNSAFE)).float().mean())
 
-    assert wrong(region) < 0.025
-    assert wrong(plain) > 2 * wrong(region)
+    assert wrong(region) < 0.01
+    assert wrong(plain) > 4 * wrong(region)
     assert int(((region != UNSAFE) & (answer == UNSAFE)).sum()) < int(((region == UNSAFE) & (answer != UNSAFE)).sum())  # caution
+
+
+def test_many_labels_are_interpolated_from_those_nearby(monkeypatch):
+    z, answer = box()
+    told = torch.arange(len(z)) < 400
+    whole = choose_and_spread(z, answer * told, told, answer, 0)[0]
+    monkeypatch.setattr("torchrl_sspl.trainers.asking._MOST", 399)
+    assert float((choose_and_spread(z, answer * told, told, answer, 0)[0] != whole).float().mean()) < 0.002
 
 
 def test_only_labels_say_s_and_no_answer_is_read_that_was_not_asked_for():
