@@ -9,11 +9,11 @@ MUTANTS = [
     (ASKING, "_DOUBT = 0.3", "_DOUBT = 30.0", ASKED),
     (ASKING, "_CAUTION = 0.1", "_CAUTION = -0.3", ASKED),
     (ASKING, "_SMOOTHING = 0.1", "_SMOOTHING = 100.0", ASKED),
+    (ASKING, "_MOST, _AROUND = 2000, 64", "_MOST, _AROUND = 2000, 1", ASKED),
     (ASKING, ".masked_fill(told, -1.0)", "", ASKED),
     (ASKING, "            far = torch.minimum(far, (seen - seen[row]).norm(dim=1))\n", "", ASKED),
-    (ASKING, "torch.where(told, region, answer)", "answer", ASKED),
     (ASKING, "return torch.where(told, answer, spread), told", "return spread, told", ASKED),
-    (ASKING, "    told, answer = told.clone(), torch", "    told, answer = told, torch", ASKED),
+    (ASKING, "    told, unsafe = told.clone(), answer", "    told, unsafe = told, answer", ASKED),
     (SYNTHESIS, "count = 0 if self.number else source.labels.choose", "count = source.labels.choose", ASKED),
     (SYNTHESIS, "        source.count_labels(answer[data", "        (answer[data", ASKED),
 ]

@@ -33,10 +33,10 @@ def first(answer: torch.Tensor, count: int) -> torch.Tensor:
 
 def test_chosen_labels_tell_where_u_ends_better_than_as_many_random_ones():
     z, answer = box()
-    region, told = choose_and_spread(z, answer * first(answer, 20), first(answer, 20), answer, 160)
+    region, told = choose_and_spread(z, first(answer, 20), answer, 160)
     assert int(told.sum()) == 200
     random = torch.arange(len(z)) < 200
-    plain, still = choose_and_spread(z, answer * random, random, answer, 0)
+    plain, still = choose_and_spread(z, random, answer, 0)
     assert torch.equal(still, random)
 
     def wrong(found: torch.Tensor) -> float:
@@ -50,33 +50,33 @@ def test_chosen_labels_tell_where_u_ends_better_than_as_many_random_ones():
 def test_many_labels_are_interpolated_from_those_nearby(monkeypatch):
     z, answer = box()
     told = torch.arange(len(z)) < 400
-    whole = choose_and_spread(z, answer * told, told, answer, 0)[0]
+    whole = choose_and_spread(z, told, answer, 0)[0]
     monkeypatch.setattr("torchrl_sspl.trainers.asking._MOST", 399)
-    assert float((choose_and_spread(z, answer * told, told, answer, 0)[0] != whole).float().mean()) < 0.002
+    assert float((choose_and_spread(z, told, answer, 0)[0] != whole).float().mean()) < 0.002
 
 
 def test_only_labels_say_s_and_no_answer_is_read_that_was_not_asked_for():
     z, answer = box()
     start = first(answer, 20)
-    region, told = choose_and_spread(z, answer * start, start, answer, 100)
+    region, told = choose_and_spread(z, start, answer, 100)
     assert torch.equal(region == SAFE, told & (answer == SAFE))
     assert (told & start == start).all()
     secret = torch.where(told, answer, UNSAFE)
-    again = choose_and_spread(z, answer * start, start, secret, 100)
+    again = choose_and_spread(z, start, secret, 100)
     assert torch.equal(again[0], region)
     assert torch.equal(again[1], told)
     # Later rounds ask for nothing, and know what was answered.
-    assert torch.equal(choose_and_spread(z, region, told, torch.zeros_like(answer), 0)[0], region)
+    assert torch.equal(choose_and_spread(z, told, answer * told, 0)[0], region)
     known = start.nonzero()[:, 0]
     rows, start = torch.cat([known, torch.arange(5), known]), torch.cat([start[known], start[:5], torch.zeros(len(known), dtype=torch.bool)])
-    assert choose_and_spread(z[rows], answer[rows] * start, start, answer[rows], 100)[1].all()  # those that look the same, too
+    assert choose_and_spread(z[rows], start, answer[rows], 100)[1].all()  # those that look the same, too
 
 
 @pytest.mark.parametrize("codes", [[UNSAFE, UNSAFE], [SAFE, SAFE]])
 def test_labels_of_one_side_alone_are_refused(codes):
     told = torch.ones(2, dtype=torch.bool)
     with pytest.raises(EmptyRegionError, match="labels of U and of what is not of U"):
-        choose_and_spread(torch.rand(2, 2), torch.tensor(codes), told, torch.tensor(codes), 0)
+        choose_and_spread(torch.rand(2, 2), told, torch.tensor(codes), 0)
 
 
 def test_a_run_asks_for_as_many_labels_as_it_may(tmp_path):

@@ -17,7 +17,7 @@ _MOST, _AROUND = 2000, 64  # labels that are interpolated all at once, and of mo
 
 
 @torch.no_grad()
-def choose_and_spread(seen: Tensor, region: Tensor, told: Tensor, answer: Tensor, count: int) -> tuple[Tensor, Tensor]:
+def choose_and_spread(seen: Tensor, told: Tensor, answer: Tensor, count: int) -> tuple[Tensor, Tensor]:
     r"""Labels for the latents of which a few labels tell least, and what labels say of all latents that have none.
 
     .. math:: f(z) = c - \sum_j w_j \lVert z - z_j \rVert, \qquad
@@ -29,9 +29,8 @@ def choose_and_spread(seen: Tensor, region: Tensor, told: Tensor, answer: Tensor
 
     Args:
         seen: ``(n, p)`` latents of single pictures.
-        region: ``(n,)`` codes of ``sets``, 0 where nothing is told.
         told: ``(n,)`` bool, whose label is known.
-        answer: ``(n,)`` codes; read only where a label is known or asked for.
+        answer: ``(n,)`` codes of ``sets``; read only where a label is known or asked for.
         count: labels that are asked for.
 
     Returns ``(n,)`` codes, in which only labels say S, and of which labels are known now, bool. Raises EmptyRegionError where nothing
@@ -41,12 +40,11 @@ def choose_and_spread(seen: Tensor, region: Tensor, told: Tensor, answer: Tensor
         >>> z = torch.linspace(-1, 1, 201)[:, None]
         >>> answer = torch.where(z[:, 0] > 0.305, 2, 0)
         >>> told = torch.zeros(201, dtype=torch.bool).index_fill(0, torch.tensor([0, 200]), True)
-        >>> region, told = choose_and_spread(z, answer * told, told, answer, 8)
+        >>> region, told = choose_and_spread(z, told, answer, 8)
         >>> int((region != answer).sum()), int(told.sum())
         (0, 10)
     """
-    told, answer = told.clone(), torch.where(told, region, answer)
-    unsafe = answer == UNSAFE
+    told, unsafe = told.clone(), answer == UNSAFE
     sides = int((told & unsafe).sum()), int((told & ~unsafe).sum())
     if 0 in sides:
         raise EmptyRegionError(

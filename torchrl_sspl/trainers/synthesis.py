@@ -105,9 +105,9 @@ class Gather(Phase):
     def _choose(self, work: Workspace) -> None:
         """Asks for labels in the first round, and spreads those that are known."""
         data, source = work.latents, work.source
-        region, told, answer = (data[k][:, 0] for k in ("region", "told", "answer"))
+        told, answer = data["told"][:, 0], data["answer"][:, 0]
         count = 0 if self.number else source.labels.choose
-        data["region"], data["told"] = (x[:, None] for x in choose_and_spread(data["seen"][:, : work.seen_dim], region, told, answer, count))
+        data["region"], data["told"] = (x[:, None] for x in choose_and_spread(data["seen"][:, : work.seen_dim], told, answer, count))
         source.count_labels(answer[data["told"][:, 0] & ~told])
 
     def _near_the_set(self, work: Workspace) -> dict[str, Tensor]:
