@@ -1,4 +1,4 @@
-"""A device that this machine lacks is refused by name, before anything is done."""
+"""A device or a compiler that this machine lacks is refused by name."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from tiny import TINY
 from torchrl_sspl import load
 from torchrl_sspl.cli import main
 from torchrl_sspl.configs import compose
-from torchrl_sspl.devices import usable_device
+from torchrl_sspl.devices import compiled, usable_device
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.experiments.run import Experiment
 
 ABSENT = f"cuda:{torch.cuda.device_count()}"
@@ -40,3 +40,18 @@ def test_the_command_line_says_so_too(tmp_path, capsys):
     assert main(["train", "env=pendulum", f"device={ABSENT}", f"out_dir={tmp_path}"]) == 2
     assert main(["evaluate", "pendulum", "--device", ABSENT]) == 2
     assert capsys.readouterr().err.count(f"received '{ABSENT}'") == 2
+
+
+def test_without_a_compiler_the_error_says_what_to_do(monkeypatch):
+    def fails(words: str):
+        def call(*_: torch.Tensor) -> torch.Tensor:
+            raise RuntimeError(words)
+
+        return lambda *_, **__: call
+
+    monkeypatch.setattr(torch, "compile", fails("InvalidCxxCompiler: No working C++ compiler found\nand more"))
+    with pytest.raises(MissingDependencyError, match="install one, or leave it out"):
+        compiled(torch.sin)(torch.ones(1))
+    monkeypatch.setattr(torch, "compile", fails("shapes do not fit"))
+    with pytest.raises(RuntimeError, match="shapes do not fit"):
+        compiled(torch.sin)(torch.ones(1))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from functools import partial
 from typing import Any
 
@@ -135,6 +136,17 @@ def test_the_agents_own_action_is_the_one_that_is_known_already():
 def test_where_no_action_keeps_the_margin_it_is_the_agents_own():
     protect = Shield(line(own=Pushes(0.4)), level=0.0, margin=0.2)  # -1 leads to B = -.15
     assert float(protect(torch.tensor([[0.45]]), torch.tensor([[1.0]])).action) == pytest.approx(0.4)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+def test_a_compiled_shield_takes_what_the_plain_one_takes():
+    g = torch.Generator().manual_seed(0)
+    latent, wanted = torch.rand(256, 1, generator=g) * 2 - 1, torch.rand(256, 1, generator=g) * 4 - 2
+    one, other = (shield(compile=compile)(latent, wanted) for compile in (False, True))
+    assert 20 < int((one.intervened & (wanted.abs()[:, 0] <= 1.0)).sum()) < 200
+    assert torch.equal(one.intervened, other.intervened)
+    torch.testing.assert_close(other.action, one.action, atol=1e-5, rtol=0.0)
+    torch.testing.assert_close(other.margin, one.margin, atol=1e-5, rtol=0.0)
 
 
 def test_rows_do_not_mix():

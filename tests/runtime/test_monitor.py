@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shutil
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,22 @@ def test_the_actions_are_the_agents_own():
     monitor, controller = Monitor.load("pendulum", batch_size=3), load("pendulum").controller(3)
     for pixels in shown(3, 4):
         assert torch.equal(monitor.step(pixels).action, controller.step(pixels).action)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+def test_a_compiled_monitor_says_what_the_plain_one_says():
+    plain, graph = (Monitor.load("pendulum", batch_size=2, compile=compile) for compile in (False, True))
+    for t, pixels in enumerate(shown(2, 12)):
+        pixels = None if t == 5 else torch.zeros_like(pixels) if t == 8 else pixels
+        wanted, found = plain.step(pixels), graph.step(pixels)
+        assert torch.equal(wanted.verdict, found.verdict)
+        assert wanted.reasons == found.reasons
+        for name, value in wanted.signals.items():
+            torch.testing.assert_close(found.signals[name], value, atol=1e-4, rtol=1e-4, equal_nan=True)
+        for name in ("action", "barrier", "latent"):
+            torch.testing.assert_close(getattr(found, name), getattr(wanted, name), atol=1e-3, rtol=1e-4)
+        for monitor in (plain, graph):
+            monitor.took(torch.full((2, 1), 3.0))
 
 
 @pytest.mark.parametrize("fault", ["dark", "bright", "colour", "noise", "salt", "shifted", "covered", "crossed", "doubled", "frozen"])

@@ -19,6 +19,7 @@ from torchrl_sspl.trainers.synthesis import synthesis_phases
 def clock(monkeypatch):
     now = SimpleNamespace(seconds=100.0)
     monkeypatch.setattr(module.time, "monotonic", lambda: now.seconds)
+    monkeypatch.setenv("COLUMNS", "200")  # a narrow window cuts the bar's words
     return now
 
 

@@ -197,14 +197,15 @@ class Agent(nn.Module):
         tried[..., hidden] = held[:, None]
         return self.barrier(tried)[..., 0].amin(0)
 
-    def controller(self, batch_size: int = 1) -> Controller:
-        """What runs on n systems side by side: with a memory of its own, and the premise of the proof watched.
+    def controller(self, batch_size: int = 1, **options: Any) -> Controller:
+        """What runs on n systems side by side: with a memory of its own, and the premise of the proof watched; options and errors are
+        those of :class:`~torchrl_sspl.modules.Controller`.
 
         Example:
             >>> load("pendulum").controller(batch_size=3).batch_size
             3
         """
-        return Controller(self, batch_size)
+        return Controller(self, batch_size, **options)
 
     def export(self, path: str | Path, **options: Any) -> Path:
         """Write one step for a machine without this library: ``.onnx``, or ``.pt2`` for ``torch.export.load``; returns the path.

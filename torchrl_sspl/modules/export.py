@@ -14,12 +14,10 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.certificate import weights_digest
-from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import CertificationError, ConfigError, MissingDependencyError
 from torchrl_sspl.files import write
 from torchrl_sspl.modules.choosing import ChoosingPolicy
-from torchrl_sspl.modules.controller import meets_premise
-from torchrl_sspl.modules.observer import completed, corrected, held
+from torchrl_sspl.modules.controller import correction, meets_premise
 
 INPUTS = ("pixels", "latent", "action", "begins")
 OUTPUTS = ("next_action", "barrier", "seen_barrier", "innovation", "met", "next_latent")
@@ -59,10 +57,7 @@ class DeployedStep(nn.Module):
         agent = self.agent
         seen = agent.encoder(pixels)
         prior = torch.where(begins[:, None], seen, agent.dynamics(latent, action))
-        seen = completed(seen, prior, agent.gain)
-        turns = direction_of(agent.dynamics)
-        now, innovation = corrected(prior, seen, agent.gain, turns)
-        now, _ = held(agent.barrier, prior, now, self.proved.held_error, turns)
+        now, innovation, _, seen = correction(agent, self.proved.held_error, seen, prior)
         barrier, of_seen = agent.barrier(now)[:, 0], agent.barrier(seen)[:, 0]
         met = meets_premise(self.proved, barrier, of_seen, (now - prior).norm(dim=-1))
         return agent.policy(now), barrier, of_seen, innovation.norm(dim=-1), met, now

@@ -2,6 +2,7 @@ r"""The safety filter: any policy's actions, changed where the agent's set would
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,6 +13,7 @@ from torch import Tensor
 
 from torchrl_sspl.certification.floating import UNITS, largest_rounding
 from torchrl_sspl.certification.loop import closed_loop
+from torchrl_sspl.devices import compiled
 from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.modules.agent import Agent
@@ -55,6 +57,7 @@ class Shield:
         level: s <= 0: actions have to keep :math:`\{B \le s\}` where the agent's own do, so that the filter acts before the border.
             A policy that is held at the border of :math:`\{B \le 0\}` meets corrections that are cut again and again, and the memory goes astray.
         margin: :math:`\eta` in place of the proved one, for an agent without a proof: then nothing is guaranteed.
+        compile: as for :class:`~torchrl_sspl.modules.Controller`.
 
     Raises:
         ConfigError: for an agent without a proof where no margin is given, or options that are not valid.
@@ -66,7 +69,9 @@ class Shield:
         torch.Size([4, 1])
     """
 
-    def __init__(self, agent: Agent, *, mode: str = "nearest", level: float = LEVEL, margin: float | None = None) -> None:
+    def __init__(
+        self, agent: Agent, *, mode: str = "nearest", level: float = LEVEL, margin: float | None = None, compile: bool = False
+    ) -> None:
         if mode not in MODES or not level <= 0.0 or (margin is not None and not margin >= 0.0):
             raise ConfigError(
                 f"expected mode in {MODES}, level <= 0 and margin >= 0 or None, received {mode!r}, {level} and {margin}"
@@ -83,6 +88,9 @@ class Shield:
         per_dimension = max(3, min(_GRID, int(_MOST ** (1 / m) + 1e-6)))
         axes = [torch.linspace(-float(s), float(s), per_dimension) for s in scale]
         self.grid = torch.cartesian_prod(*axes).reshape(-1, m) if per_dimension**m <= 4 * _MOST else torch.zeros(0, m)
+        self._compiled = compile
+        as_run: Callable[..., Any] = compiled if compile else lambda function: function
+        self._first, self._near = as_run(self._judged), as_run(self._nearest)
 
     @torch.no_grad()
     def __call__(self, latent: Tensor, wanted: Tensor, own: Tensor | None = None) -> Protected:
@@ -97,6 +105,18 @@ class Shield:
                 raise ShapeError(f"expected actions of shape ({len(latent)}, {m}), received {tuple(given.shape)}")
         if not bool(wanted.isfinite().all()):
             raise NonFiniteError("expected finite actions, received NaN or infinity from the policy that is to be protected")
+        asked, own, taken, after_own, after, most, lost = self._first(latent, wanted, own)
+        if bool(lost.any()):
+            # A graph is for one number of rows.
+            rows = torch.arange(len(lost), device=lost.device) if self._compiled else lost.nonzero()[:, 0]
+            near, then = self._near(latent[rows], asked[rows], own[rows], after_own[rows], most[rows])
+            taken[rows], after[rows] = torch.where(lost[rows, None], near, taken[rows]), torch.where(lost[rows], then, after[rows])
+        change = (taken - wanted) / self.scale.to(wanted)
+        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self.level - self.margin - after)
+
+    def _judged(self, latent: Tensor, wanted: Tensor, own: Tensor | None) -> tuple[Tensor, ...]:
+        """Actions asked for, the agent's own, and those of the two that are taken; the barrier after its own and after the taken ones,
+        the most that is allowed; and for which rows another action is to be found."""
         scale = self.scale.to(wanted)
         asked = wanted.clamp(-scale, scale)
         own, inside = self.agent.policy(latent) if own is None else own, self.agent.barrier(latent)[:, 0] <= 0.0
@@ -104,17 +124,13 @@ class Shield:
         most = after_own.clamp(self.level - self.margin, -self.margin)
         keeps = inside & ((after <= most) | (asked == own).all(1))  # [V] speaks of the agent's own
         taken, after = torch.where(keeps[:, None], asked, own), torch.where(keeps, after, after_own)
-        rows = (inside & ~keeps).nonzero()[:, 0]
-        if len(rows):
-            taken[rows], after[rows] = self._near(latent[rows], asked[rows], own[rows], after_own[rows], most[rows])
-        change = (taken - wanted) / scale
-        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self.level - self.margin - after)
+        return asked, own, taken, after_own, after, most, inside & ~keeps
 
     def _after(self, latent: Tensor, action: Tensor) -> Tensor:
         """``(n,)`` barrier values of successors."""
         return self.agent.barrier(self.agent.dynamics(latent, action))[:, 0]
 
-    def _near(self, latent: Tensor, asked: Tensor, own: Tensor, after_own: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
+    def _nearest(self, latent: Tensor, asked: Tensor, own: Tensor, after_own: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
         """The nearest actions tried that keep the set, and the barrier after them; the agent's own ones where none does."""
         share = torch.linspace(0.0, 1.0, _LINE + 1, device=asked.device)[1:, None]
         tried = torch.lerp(asked[:, None], own[:, None], share)

@@ -19,6 +19,7 @@ from torch.nn import functional as F
 from tqdm import tqdm
 
 from torchrl_sspl.certification.certificate import weights_digest
+from torchrl_sspl.devices import compiled
 from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import Decision
 from torchrl_sspl.evaluation.simulation import simulate
@@ -165,6 +166,7 @@ class Monitor:
         period: time between two pictures, in the unit of the times given to :meth:`step`.
         clear_after: clean steps that end an alarm.
         signals: which of :data:`SIGNALS` are watched.
+        compile: as for :class:`~torchrl_sspl.modules.Controller`.
 
     Raises:
         ConfigError: for options that are not valid.
@@ -185,6 +187,7 @@ class Monitor:
         period: float | None = None,
         clear_after: int = 10,
         signals: Sequence[str] = SIGNALS,
+        compile: bool = False,
     ) -> None:
         if isinstance(signals, str) or not set(signals) <= set(SIGNALS):
             raise ConfigError(f"expected signals among {', '.join(SIGNALS)}, received {signals!r}")
@@ -197,6 +200,7 @@ class Monitor:
         self.agent, self.calibration, self.batch_size = agent, calibration, batch_size
         self.fallback, self.period, self.clear_after, self.signals = fallback, period, clear_after, tuple(signals)
         self._controller = Controller(agent, batch_size)
+        self._look = compiled(self._looked) if compile else self._looked
         self.reset()
 
     @classmethod
@@ -232,11 +236,14 @@ class Monitor:
             raise ShapeError(f"expected pictures of {n} systems, received {tuple(pixels.shape)}; make a monitor for them")
         reasons = [[] for _ in range(n)] if late is None else [["time"] if bool(one) else [] for one in late]
         fault = self._unreadable(pixels)
-        step = self._controller.step(None if fault else pixels)
         if fault or pixels is None:  # the memory goes on with what it expects, and the proof no longer applies
+            step = self._controller.step(None)
             signals = {name: torch.full_like(step.barrier, math.nan) for name in SIGNALS}
             return self._decided(step, signals, [[fault, *found] for found in reasons])
-        signals = {"innovation": step.innovation.masked_fill(fresh, math.nan)} | self._looked_at(pixels, step.seen, fresh)
+        pixels = pixels.to(fresh.device)
+        step, predicted, signals = self._look(pixels, *self._controller.expected())
+        self._controller.remember(step, predicted)
+        signals |= self._compared(pixels, fresh)
         if self.signals:
             value = torch.stack([signals[name] for name in self.signals], 1)
             low, high = value.new_tensor([self.calibration.limits[name] for name in self.signals]).unbind(1)
@@ -251,20 +258,22 @@ class Monitor:
         """
         self._controller.took(action)
 
-    def _looked_at(self, pixels: Tensor, seen: Tensor, fresh: Tensor) -> dict[str, Tensor]:
-        """The signals that pictures give, and what is remembered of them."""
-        pixels = pixels.to(seen.device)
-        before, frame = pixels[:, :3], pixels[:, 3:].float() / 255.0
-        off = (small(frame) - self.calibration.model(seen)).abs().mean(1)
+    def _looked(self, pixels: Tensor, prior: Tensor, begins: Tensor) -> tuple[Step, Tensor, dict[str, Tensor]]:
+        """The controller's look, and the signals of the newest frame; nothing is remembered, so that it can be compiled."""
+        step, predicted = self._controller.looked(pixels, prior, begins)
+        frame = pixels[:, 3:].float() / 255.0
+        off = (small(frame) - self.calibration.model(step.seen)).abs().mean(1)
         texture = (frame.diff(dim=-1).abs().mean((1, 2, 3)) + frame.diff(dim=-2).abs().mean((1, 2, 3))) / 2
-        known = torch.full_like(texture, math.nan) if self._frame is None else _apart(before, self._frame)
-        same = (pixels[:, :3] == pixels[:, 3:]).flatten(1).all(1)
-        self._still = torch.where(same & ~fresh, self._still + 1.0, 0.0)
-        self._frame = pixels[:, 3:].clone()
-        return {
-            "picture": off.mean((1, 2)), "place": off.amax((1, 2)), "texture": texture,
-            "order": known.masked_fill(fresh, math.nan), "still": self._still.clone(),
-        }  # fmt: skip
+        innovation = step.innovation.masked_fill(begins, math.nan)
+        return step, predicted, {"innovation": innovation, "picture": off.mean((1, 2)), "place": off.amax((1, 2)), "texture": texture}
+
+    def _compared(self, pixels: Tensor, fresh: Tensor) -> dict[str, Tensor]:
+        """The signals of frames beside frames, and what is remembered of them; bytes are compared faster than a graph does it."""
+        before, frame = pixels[:, :3], pixels[:, 3:].clone()
+        known = torch.full_like(self._still, math.nan) if self._frame is None else _apart(before, self._frame)
+        same = (before == frame).flatten(1).all(1)
+        self._frame, self._still = frame, torch.where(same & ~fresh, self._still + 1.0, 0.0)
+        return {"order": known.masked_fill(fresh, math.nan), "still": self._still.clone()}
 
     def _unreadable(self, pixels: Tensor | None) -> str:
         """Why pictures cannot be looked at; "" if they can."""

@@ -134,7 +134,7 @@ class _Guard:
         if size is not None and tuple(size) != shown:
             raise ShapeError(f"expected pictures of {tuple(size)} pixels, received {shown}; resize them inside of this wrapper")
         self.statistics: dict[str, float] = {"steps": 0, "interventions": 0, "deviation": 0.0}
-        self._type, self._controller = actions.dtype, Controller(agent, n)
+        self._type, self._controller = actions.dtype, Controller(agent, n, compile=bool(options.get("compile", False)))
         self._held = agent.held_error > 0.0
         self._latent: Tensor | None = None
 
