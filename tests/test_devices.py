@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import shutil
+
 import pytest
 import torch
 from tiny import TINY
+from torch import nn
 
 from torchrl_sspl import load
 from torchrl_sspl.cli import main
@@ -51,7 +54,26 @@ def test_without_a_compiler_the_error_says_what_to_do(monkeypatch):
 
     monkeypatch.setattr(torch, "compile", fails("InvalidCxxCompiler: No working C++ compiler found\nand more"))
     with pytest.raises(MissingDependencyError, match="install one, or leave it out"):
-        compiled(torch.sin)(torch.ones(1))
+        compiled(lambda x: 2 * x)(torch.ones(1))
     monkeypatch.setattr(torch, "compile", fails("shapes do not fit"))
     with pytest.raises(RuntimeError, match="shapes do not fit"):
-        compiled(torch.sin)(torch.ones(1))
+        compiled(lambda x: 2 * x)(torch.ones(1))
+
+
+class Asked(nn.Module):
+    """What a module of one's own may be asked, such as an agent's policy."""
+
+    def __init__(self, answer: nn.Module) -> None:
+        super().__init__()
+        self.answer = answer
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.answer(x)
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
+@torch.no_grad()
+def test_each_module_has_a_graph_of_its_own():
+    x = torch.tensor([[-1.0, 2.0]])
+    for answer in (nn.ReLU(), nn.Tanh(), nn.Linear(2, 2), nn.Linear(2, 2)):
+        assert torch.allclose(compiled(Asked(answer).forward)(x), answer(x))

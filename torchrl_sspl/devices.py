@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import FunctionType, MethodType
 from typing import Any
 
 import torch
@@ -32,7 +33,7 @@ def usable_device(name: torch.device | str) -> torch.device:
 
 
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function of tensors as one graph for the shapes that it is called with; the first call compiles, for up to half a minute.
+    """A Python function or method of tensors as one graph for the shapes it is called with; the first call compiles, for up to half a minute.
 
     What it takes from frozen modules must not change afterwards. When called, a MissingDependencyError if this machine has no
     compiler for it. Source: none.
@@ -42,9 +43,13 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
         >>> double(torch.ones(1))  # doctest: +SKIP
         tensor([2.])
     """
-    # The modules are frozen, so their weights need not be looked at again in every call.
+    # The modules are frozen, so they need not be looked at again in every call. Graphs are kept by code, and would be taken for those
+    # of other modules of the same shapes: each gets a copy of the code.
     options: dict[str, Any] = {"guard_filter_fn": torch.compiler.skip_guard_on_all_nn_modules_unsafe}
-    graph = torch.compile(function, fullgraph=True, dynamic=False, options=options)
+    plain = getattr(function, "__func__", function)
+    own = FunctionType(plain.__code__.replace(), plain.__globals__, plain.__name__, plain.__defaults__, plain.__closure__)
+    bound = own if plain is function else MethodType(own, function.__self__)  # type: ignore[attr-defined]
+    graph = torch.compile(bound, fullgraph=True, dynamic=False, options=options)
 
     def call(*given: Any) -> Any:
         try:
