@@ -1,15 +1,17 @@
 """Kills or interrupts a training at random moments of all its phases, resumes it, and compares it with one that nobody touched.
 
-Run: python benchmarks/resume.py env=pendulum [kills=20] [signal=KILL] [runs=1] [kill_seed=0] [folder=runs/resume] [key=value ...]
+Run: python benchmarks/resume.py env=pendulum [kills=20] [signal=KILL] [runs=1] [kill_seed=0] [folder=runs/resume] [fast=true] [key=value ...]
 
 `signal=INT` and `signal=TERM` have to end it with code 130 or 143, no traceback, and one line that says where the state is.
 The kills are spread over `runs` trainings, each compared at its end, bit for bit: weights, log, held-out checks and budget.
-Every phase is struck once before one is struck twice. `key=value` go to the training, which is that of `preset=smoke`.
+Every phase is struck once before one is struck twice. `key=value` go to the training, which is that of `preset=smoke`;
+`fast=false kills=0` tells how far checkpoints lie apart with the settings that a run has by default.
 Exits with 1 if anything differs.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import random
@@ -67,8 +69,10 @@ class Training:
             command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background of a shell it is ignored
         )  # fmt: skip
+        self.saved = [time.time()]  # when it began, and when each checkpoint was written
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
+        threading.Thread(target=self._watch, args=(folder / "checkpoints",), daemon=True).start()
 
     def _read(self) -> None:
         assert self.process.stderr is not None
@@ -77,6 +81,17 @@ class Training:
             self.seen.resumed |= "resumed" in part
             for found in BAR.finditer(part):
                 self.seen.times.setdefault((found["phase"], int(found["step"])), time.monotonic() - self.began)
+
+    def _watch(self, folder: Path) -> None:
+        while self.process.poll() is None:
+            found = [at for at in (_written(path) for path in folder.glob("*")) if at > self.saved[-1]]
+            self.saved += sorted(found)[-1:]
+            time.sleep(0.1)
+
+    @property
+    def at_risk(self) -> float:
+        """Longest time between two checkpoints, or before the first one, in s: what a kill can cost."""
+        return max((b - a for a, b in itertools.pairwise(self.saved)), default=float("nan"))
 
     def finish(self) -> Seen:
         """Wait for its end."""
@@ -112,6 +127,14 @@ class Training:
         return f"; WRONG END: code {self.process.returncode}, said {said}, then {self.seen.text[-1500:]!r}"
 
 
+def _written(path: Path) -> float:
+    """When a file was; 0 if it is gone already."""
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
+
+
 def moments(seen: Seen, kills: int, draw: random.Random) -> list[tuple[str, int, float]]:
     """Phase, step and delay of every kill, in order: every phase once before one has two, uniform in the time of each."""
     phases = seen.phases
@@ -138,7 +161,7 @@ def differences(one: Path, other: Path) -> list[str]:
 
 def main(words: list[str]) -> int:
     """Run it."""
-    own = {"kills": "20", "signal": "KILL", "runs": "1", "kill_seed": "0", "folder": "runs/resume"}
+    own = {"kills": "20", "signal": "KILL", "runs": "1", "kill_seed": "0", "folder": "runs/resume", "fast": "true"}
     for word in list(words):
         key, _, value = word.partition("=")
         if key in own:
@@ -147,11 +170,15 @@ def main(words: list[str]) -> int:
     number = signal.Signals[f"SIG{own['signal'].removeprefix('SIG')}"]
     folder, kills, runs, draw = Path(own["folder"]), int(own["kills"]), int(own["runs"]), random.Random(int(own["kill_seed"]))
     systems = [w for w in words if w.startswith("env=")]
-    settings = [*systems, *FAST, *(w for w in words if w not in systems)]
+    settings = [*systems, *(FAST if own["fast"] == "true" else []), *(w for w in words if w not in systems)]
     if folder.exists():
         shutil.rmtree(folder)
-    whole = Training(settings, folder / "whole").finish()
-    print(f"not interrupted: {len(whole.phases)} phases ({', '.join(whole.phases)}), {max(whole.times.values()):.0f} s", flush=True)
+    untouched = Training(settings, folder / "whole")
+    whole = untouched.finish()
+    print(
+        f"not interrupted: {len(whole.phases)} phases ({', '.join(whole.phases)}), {max(whole.times.values()):.0f} s, "
+        f"at most {untouched.at_risk:.1f} s between two checkpoints", flush=True,
+    )  # fmt: skip
     plan, equal, struck, bad = moments(whole, kills, draw), 0, 0, 0
     for run in range(runs):
         place, mine = folder / f"killed{run}", plan[run::runs]
