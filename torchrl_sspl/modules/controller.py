@@ -210,7 +210,8 @@ class Controller:
 
     def remember(self, step: Step, predicted: Tensor, rows: Tensor | None = None) -> Step:
         """The step that was looked at, from now on the last one, with what is known of all steps since the reset."""
-        self._applies = step.applies = self._applies & step.applies
+        self._applies = self._applies & step.applies
+        step.applies = self._applies.clone()  # the caller's, whom a reset of some rows does not reach
         self._memory.expect(predicted, rows)
         self._last = step.latent, step.action.shape
         return step
