@@ -281,7 +281,7 @@ def test_quadrupeds_agent_answers_from_the_gpu():
 
 
 def test_certificates_say_the_same_of_an_agent_on_the_gpu(pair):
-    options = {"level": 0.0, "horizon": 5, "budget": Budget(seconds=60.0)}
+    options = {"level": 0.0, "horizon": 5, "budget": Budget(seconds=600.0)}
     known = [certify(agent, PendulumEnv(batch_size=[1]), episodes=20, **options) for agent in pair]
     resets = [certify_on_episodes(agent, PendulumEnv, episodes=20, envs=10, **options) for agent in pair]
     for here, there in (known, resets):
