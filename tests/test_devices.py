@@ -60,20 +60,9 @@ def test_without_a_compiler_the_error_says_what_to_do(monkeypatch):
         compiled(lambda x: 2 * x)(torch.ones(1))
 
 
-class Asked(nn.Module):
-    """What a module of one's own may be asked, such as an agent's policy."""
-
-    def __init__(self, answer: nn.Module) -> None:
-        super().__init__()
-        self.answer = answer
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        return self.answer(x)
-
-
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 @torch.no_grad()
 def test_each_module_has_a_graph_of_its_own():
     x = torch.tensor([[-1.0, 2.0]])
     for answer in (nn.ReLU(), nn.Tanh(), nn.Linear(2, 2), nn.Linear(2, 2)):
-        assert torch.allclose(compiled(Asked(answer).forward)(x), answer(x))
+        assert torch.allclose(compiled(nn.Sequential(answer).forward)(x), answer(x))

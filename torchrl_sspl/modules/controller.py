@@ -46,9 +46,8 @@ class Memory:
     def correct(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Latents and innovations ``(n, p)`` for what is seen ``(n, p)``, where a correction was cut ``(n,)``, and what is seen
         with what no picture shows; nothing is remembered."""
-        if self.begins is None or self.prior is None:
-            self.prior, self.begins = seen, torch.ones(len(seen), dtype=torch.bool, device=seen.device)
-        return correction(self.agent, self.held_error, seen, torch.where(self.begins[:, None], seen, self.prior))
+        prior, begins = self.expected(len(seen))
+        return correction(self.agent, self.held_error, seen, torch.where(begins[:, None], seen, prior))
 
     def expected(self, n: int) -> tuple[Tensor, Tensor]:
         """What is expected ``(n, p)``, zeros where nothing is, and which episodes begin ``(n,)``."""

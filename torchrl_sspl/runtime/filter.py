@@ -2,7 +2,6 @@ r"""The safety filter: any policy's actions, changed where the agent's set would
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -89,8 +88,8 @@ class Shield:
         axes = [torch.linspace(-float(s), float(s), per_dimension) for s in scale]
         self.grid = torch.cartesian_prod(*axes).reshape(-1, m) if per_dimension**m <= 4 * _MOST else torch.zeros(0, m)
         self._compiled = compile
-        as_run: Callable[..., Any] = compiled if compile else lambda function: function
-        self._first, self._near = as_run(self._judged), as_run(self._nearest)
+        self._first = compiled(self._judged) if compile else self._judged
+        self._near = compiled(self._nearest) if compile else self._nearest
 
     @torch.no_grad()
     def __call__(self, latent: Tensor, wanted: Tensor, own: Tensor | None = None) -> Protected:
