@@ -206,9 +206,9 @@ def test_an_agent_without_a_proof_is_said_to_have_none(monkeypatch):
     load = Monitor.load
 
     def unproved(name: str) -> Monitor:
-        monitor = load(name)
-        monitor.agent.description["tolerated_error"] = 0.0
-        return monitor
+        known = load(name)
+        known.agent.description["tolerated_error"] = 0.0
+        return Monitor(known.agent, known.calibration)  # what is proved is read when a monitor is made
 
     monkeypatch.setattr(Monitor, "load", unproved)
     _, events, _ = seen(steps=3)
