@@ -8,6 +8,7 @@ of the quadruped in PyBullet. An agent without a proof gets the margin --margin,
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -80,6 +81,23 @@ def towards_obstacle(env: Any, state: Tensor, held: Tensor, generator: torch.Gen
     return torch.where(when.amin(1, keepdim=True) < LOOKAHEAD, chosen, env.max_action * aside.sgn())
 
 
+def reachable(env: Any, state: Tensor) -> int:
+    """From how many states a car can be steered into U at all: any turn for a while, any for another while, and then any."""
+    whiles = range(0, TURNS - TURNS // 4, 3)
+    plans = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), whiles, (-1.0, 0.0, 1.0), whiles, (-1.0, 0.0, 1.0))))
+    entered = 0
+    for some in state.split(50):
+        x, (first, until, second, longer, third) = some.repeat_interleave(len(plans), 0), plans.repeat(len(some), 1).T
+        out = hit = torch.zeros(len(x), dtype=torch.bool)
+        for t in range(LOOKAHEAD):
+            turn = torch.where(t < until, first, torch.where(t < until + longer, second, third))
+            x = env.wrap(env.dynamics(x, env.max_action * turn[:, None]))
+            out = out | ~env.state_space.contains(x)
+            hit = hit | (~out & (env.region(x)[:, 0] == UNSAFE))
+        entered += int(hit.reshape(len(some), -1).any(1).sum())
+    return entered
+
+
 ADVERSARIAL = {"pendulum": away_from_upright, "quadruped": towards_obstacle}
 
 
@@ -146,6 +164,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.noise > 0.0 and not given.physics:
         shown = agent.barrier(encode_states(agent, env, start, draw=noisy(env.draw, given.noise)))[:, 0] <= 0.0
         print(f"Starts that this camera shows in {{B <= 0}}: {int(shown.sum()):,} of {len(start):,}\n")
+    if given.agent == "quadruped" and given.only in (None, "adversarial"):
+        print(f"Starts from which any of a thousand plans enters U before the car leaves: {reachable(env, start):,} of {len(start):,}\n")
     print("| Actions | filter | episodes that enter U | hit | fallen | steps with an intervention | mean deviation [half ranges] |")
     print("|---|---|---|---|---|---|---|")
     policies = {"random": random_actions, "adversarial": ADVERSARIAL[given.agent], "own": None}

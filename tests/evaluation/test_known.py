@@ -16,7 +16,7 @@ from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.envs.dubins import YAW_LAG
 from torchrl_sspl.evaluation.controllers import as_controller
-from torchrl_sspl.evaluation.known import barrier_of, encode_states, evaluate, latency, states_where
+from torchrl_sspl.evaluation.known import _Run, barrier_of, encode_states, evaluate, latency, states_where
 from torchrl_sspl.evaluation.measurements import Evaluation, quantiles, share
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
@@ -121,15 +121,21 @@ def test_an_agent_gets_everything():
 
 
 def test_random_numbers_are_drawn_in_the_order_of_the_published_tables():
-    agent, env, found = small_agent(), pendulum(), of_small_agent()
+    agent, env, found, n = small_agent(), pendulum(), of_small_agent(), 25 * SMALL.episodes
     generator = torch.Generator().manual_seed(SMALL.seed)
-    value = agent.barrier(encode_states(agent, env, env.safe_set.sample(10000, generator=generator)))
+    value = agent.barrier(encode_states(agent, env, env.safe_set.sample(2 * n, generator=generator)))
     assert found["worst_safe_barrier"] == float(value.max())
     assert found["lipschitz_sampled"] == lipschitz_lower(agent.barrier, -1.0, 1.0, n=20000, generator=generator)
-    start = env.sample_states(5000, generator=generator)
-    action = (2 * torch.rand(5000, 1, generator=generator) - 1) * env.max_action
+    start = env.sample_states(n, generator=generator)
+    action = (2 * torch.rand(n, 1, generator=generator) - 1) * env.max_action
     z, after = (encode_states(agent, env, x) for x in (start, env.wrap(env.dynamics(start, action))))
     assert found["random_action_error_mean"] == pytest.approx(float((agent.dynamics(z, action) - after).norm(dim=-1).mean()), 1e-3)
+
+
+@pytest.mark.parametrize(("episodes", "samples"), [(1, 25), (199, 4975), (200, 5000), (10_000, 5000)])
+def test_measurements_of_single_states_have_5000_samples_unless_few_episodes_are_asked_for(episodes, samples):
+    run = _Run(*[None] * 3, EvaluationConfig(episodes=episodes), *[None] * 6)
+    assert run.samples == samples
 
 
 def test_unsafe_states_have_a_grid_of_their_own_where_the_system_says_so():

@@ -170,7 +170,8 @@ def certify_on_episodes(
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
         >>> from torchrl_sspl.modules.agent import load
-        >>> certificate = certify_on_episodes(load("pendulum"), PendulumEnv, episodes=4, horizon=3, envs=4)
+        >>> short = {"episodes": 4, "horizon": 3, "envs": 4, "budget": Budget(boxes=1000)}  # nothing is proved with so little effort
+        >>> certificate = certify_on_episodes(load("pendulum"), PendulumEnv, **short)
         >>> sorted(certificate.layers)
         ['deterministic', 'paper', 'run-time', 'statistical']
     """

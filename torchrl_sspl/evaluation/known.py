@@ -114,6 +114,11 @@ class _Run:
     generator: torch.Generator
     out: Evaluation = field(default_factory=Evaluation)
 
+    @property
+    def samples(self) -> int:
+        """Fresh states of a measurement without episodes: 5,000, fewer where few episodes are asked for."""
+        return min(5000, 25 * max(1, self.config.episodes))
+
     def barrier(self, state: Tensor) -> Tensor | None:
         return barrier_of(self.acts, self.env, state, draw=self.draw)
 
@@ -176,7 +181,7 @@ def evaluate(
     safe_barrier = _sets(run)
     if known is not None:
         _lipschitz(run, known)
-        seen = twin.sample_states(5000, generator=generator)
+        seen = twin.sample_states(run.samples, generator=generator)
         action = (2 * torch.rand(len(seen), twin.action_dim, generator=generator) - 1) * twin.max_action
         error = _step_errors(run, known, seen, action)
         quantiles(run.out, "random_action_error", error, "latent", "uniform states and actions")
@@ -199,7 +204,7 @@ def _sets(run: _Run) -> Tensor | None:
     out.arrays.update(states=states, viability=run.kernel.interpolate(states), unsafe=unsafe)
     latent = None if run.agent is None else encode_states(run.agent, env, states, draw=run.draw)
     barrier = run.barrier(states) if run.agent is None else run.agent.barrier(latent)[:, 0]
-    safe_barrier = run.barrier(env.safe_set.sample(10000, generator=run.generator))
+    safe_barrier = run.barrier(env.safe_set.sample(2 * run.samples, generator=run.generator))
     names = ("unsafe_called_safe", "safe_called_unsafe", "volume_over_kernel", "false_safe", "false_safe_of_doomed")
     if barrier is None or safe_barrier is None:
         out.missing(*names)
@@ -257,11 +262,11 @@ def _lipschitz(run: _Run, agent: Agent) -> None:
 def _margins(run: _Run, agent: Agent, safe_barrier: Any) -> None:
     """The paper's margins, and how far the conditions hold with them."""
     env, out, latent, barrier = run.env, run.out, run.out.arrays["latent"], run.out.arrays["barrier"]
-    fresh = encode_states(agent, env, env.sample_states(5000, generator=run.generator), draw=run.draw)
+    fresh = encode_states(agent, env, env.sample_states(run.samples, generator=run.generator), draw=run.draw)
     nearest = torch.cat([torch.cdist(part, latent).amin(1) for part in fresh.split(CHUNK)])
     note = f"fresh latents to the nearest of {len(latent)} latents of the grid"
     quantiles(out, "covering_radius", nearest, "latent", f"{note}; not a covering radius of all observations")
-    error = _step_errors(run, agent, states_where(run.inside, env.state_space, 5000, run.generator))
+    error = _step_errors(run, agent, states_where(run.inside, env.state_space, run.samples, run.generator))
     psi = functional.safety_margin(agent.lipschitz_bound, float(nearest.max()), mode="paper").q1
     eta = functional.dynamics_margin(agent.lipschitz_bound, float(error.max()) if len(error) else math.nan)
     out.add(Measurement("safety_margin", psi, "barrier", len(fresh), note="psi* = L_B eps-bar"))
