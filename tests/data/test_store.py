@@ -277,9 +277,6 @@ def test_empty_sets_and_bad_shares_are_named():
 
 
 def test_prioritised_replay_draws_what_the_losses_find_hard():
-    prioritized = pytest.importorskip("torchrl.data.replay_buffers.samplers.prioritized")
-    if getattr(prioritized, "SumSegmentTreeFp32", None) is None:
-        pytest.skip("torchrl's extension does not load with this torch: 2.14 or newer")
     buffer = TransitionStore(100).replay_buffer(200, sampler=PrioritizedSampler(100, alpha=1.0, beta=1.0))
     buffer.extend(episode(10))
     batch = buffer.sample()
