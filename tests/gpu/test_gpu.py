@@ -137,7 +137,14 @@ def test_experiments_run_on_the_gpu_and_return_an_agent_on_the_cpu(tmp_path):
     assert outcome.evaluation["volume_over_kernel"] is not None
 
 
-@pytest.mark.parametrize("options", [[], ["trainer.autocast=bfloat16"], ["trainer.compile=true"]], ids=["plain", "mixed", "compile"])
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param([], id="plain"),
+        pytest.param(["trainer.autocast=bfloat16"], id="mixed"),
+        pytest.param(["trainer.compile=true"], id="compile", marks=pytest.mark.slow),
+    ],
+)
 def test_experiments_train_on_the_gpu(options, tmp_path):
     experiment = Experiment(compose([*JOINT, *options, "device=cuda", f"out_dir={tmp_path}"]))
     experiment.train()
@@ -294,6 +301,10 @@ def test_certificates_say_the_same_of_an_agent_on_the_gpu(pair):
         assert [(s.name, s.holds) for s in layer.statements] == [(s.name, s.holds) for s in there.layers[name].statements]
     proved = [(s.name, s.holds) for s in here.layers["deterministic"].statements]
     assert proved == [(s.name, s.holds) for s in resets.layers["deterministic"].statements]
+
+
+@pytest.mark.slow
+def test_an_agent_on_the_gpu_is_proved(pair):
     assert certify(pair[1], None, level=0.0, budget=Budget(seconds=600.0)).layers["deterministic"].holds
 
 

@@ -78,7 +78,7 @@ def uninterrupted(tmp_path_factory):
     return found, found.train()
 
 
-@pytest.mark.parametrize("checkpoints", [1, 2, 3, 4, 8, 13, 21, 27])
+@pytest.mark.parametrize("checkpoints", [2, 4, 8, 21, 27, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 3, 13)]])
 def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkpoints):
     whole, expected = uninterrupted
     killed_after(experiment(tmp_path, EVERY_STEP), checkpoints)

@@ -122,8 +122,9 @@ def certify(
 
     Example:
         >>> from torchrl_sspl.modules.agent import load
-        >>> certify(load("pendulum"), None, name="pendulum").layers["deterministic"].holds
-        True
+        >>> certificate = certify(load("pendulum"), None, level=0.0, budget=Budget(boxes=1000))  # 50,000 boxes prove all of it
+        >>> {s.name: s.holds for s in certificate.layers["deterministic"].statements if s.name in ("Lipschitz constant", "invariance")}
+        {'Lipschitz constant': True, 'invariance': False}
     """
     if env is None:
         return _proved(agent, name, level, budget)
