@@ -31,7 +31,7 @@ from torchrl_sspl.trainers.source import Source
 
 LOG_FILE = "log.jsonl"
 _MOST_ACTIONS = 729  # in the grid that is tried at every latent
-_PLAIN = ("kept_share", "logged_round", "level", "warnings", "skip")  # of a workspace's state, what JSON can write
+_PLAIN = ("kept_share", "logged_round", "level", "warnings", "skip", "known")  # of a workspace's state, what JSON can write
 
 
 def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
@@ -215,6 +215,8 @@ class Workspace:
         self.warnings: list[str] = []
         self.skip = False  # nothing more can be done on these latents
         self.cache: dict[str, Any] = {}  # what a phase can compute again
+        self.known: dict[str, float] = {}  # what it should not; see Phase.once
+        self.save: Callable[[], None] = lambda: None  # a checkpoint, if it is time for one
         self.begin()
 
     def begin(self) -> None:
@@ -372,6 +374,14 @@ class Phase:
         """Do it; after an interruption it is called again, with ``work.loop`` where it was."""
         raise NotImplementedError
 
+    @staticmethod
+    def once(work: Workspace, name: str, compute: Callable[[], float]) -> float:
+        """A number that takes long, kept in checkpoints until this phase is done: after an interruption it is not computed again."""
+        if name not in work.known:
+            work.known[name] = compute()
+            work.save()
+        return work.known[name]
+
 
 class Phases(TrainerHookBase):
     """Runs phases on what they share, in order, when a trainer has collected all of its transitions.
@@ -423,7 +433,7 @@ class Phases(TrainerHookBase):
         if not self.resumed:
             self._save(force_save=True)  # the joint training is done
             work.begin()
-        work.loop.tick = self._tick
+        work.loop.tick, work.save = self._tick, self._save
         own_bar = self.bar is None
         if own_bar:
             self.bar = Progress(self.steps, self.steps_done, shown=self.progress, out_dir=work.out_dir)
@@ -437,6 +447,7 @@ class Phases(TrainerHookBase):
             if not work.skip:
                 phase.run(work)
             work.loop.restart()
+            work.known.clear()
             self.done += 1
             self.bar.move(before + self.steps_done)
             self._tell(phase)

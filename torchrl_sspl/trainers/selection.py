@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import torch
@@ -100,7 +101,7 @@ class CheckRound(Phase):
         apart = [v for v in levels if all(found <= most for _, found, most in self._mixed(work, held_out, v))]
         for level in apart[::_STEP][:_TRIED]:
             agent = work.agent(level)
-            agent.description["tolerated_error"] = tolerated = premise(agent)
+            agent.description["tolerated_error"] = tolerated = self.once(work, f"premise at {level}", partial(premise, agent))
             fresh = self._held_out(work, agent) if tolerated > 0 else None
             if fresh is None:
                 continue
