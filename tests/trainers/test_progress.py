@@ -92,7 +92,7 @@ def test_every_round_ends_with_a_sentence(capsys):
     loop = SimpleNamespace(step=0, restart=lambda: None, loss=None)
     work = SimpleNamespace(
         checks=[], config=SimpleNamespace(check_episodes=4000), loop=loop, skip=False, begin=lambda: None, finish=lambda: None,
-        out_dir=None,
+        out_dir=None, known={},
     )
     Phases([Checked(0)], work, progress=True).run()
     said = "".join(capsys.readouterr())
