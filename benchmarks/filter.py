@@ -30,6 +30,9 @@ from torchrl_sspl.sets import UNSAFE
 STEPS, SEED = 200, 20261122
 TURNS, LOOKAHEAD = 32, 60  # longest turn that the adversarial driver of a car thinks of, and how far it looks ahead, in steps
 
+SIDES = (-1.0, 0.0, 1.0)
+PLANS = list(itertools.product(SIDES, range(0, 24, 3), SIDES, range(0, 24, 3), SIDES))  # a turn for so many steps, another one, a third
+
 
 class Driver:
     """Actions from true states, as what acts in ``simulate``: on known dynamics from its camera's states, else from poses."""
@@ -65,16 +68,21 @@ def away_from_upright(env: Any, state: Tensor, held: Tensor, generator: torch.Ge
     return env.max_action * torch.sign(state[:, :1] + 0.3 * state[:, 1:])
 
 
+def first_entry(env: Any, state: Tensor, turns: Callable[[int], Tensor]) -> Tensor:
+    """Step ``(n,)`` in which cars enter U under turns ``(n, 1)`` in [-1, 1] at every step; LOOKAHEAD where they leave first, or never do."""
+    when, out = torch.full((len(state),), LOOKAHEAD), torch.zeros(len(state), dtype=torch.bool)
+    for t in range(LOOKAHEAD):
+        state = env.wrap(env.dynamics(state, env.max_action * turns(t)))
+        out |= ~env.state_space.contains(state)
+        when = torch.where(~out & (env.region(state)[:, 0] == UNSAFE), when.clamp(max=t), when)
+    return when
+
+
 def towards_obstacle(env: Any, state: Tensor, held: Tensor, generator: torch.Generator) -> Tensor:
     """The way into U that is there first, of full turns to either side and then straight ahead; the shorter turn to its middle if none is."""
     turns = torch.arange(-TURNS, TURNS + 1, 2)
     x, k = state.repeat_interleave(len(turns), 0), turns.repeat(len(state))[:, None]
-    when, out = torch.full((len(x),), LOOKAHEAD), torch.zeros(len(x), dtype=torch.bool)
-    for t in range(LOOKAHEAD):
-        x = env.wrap(env.dynamics(x, env.max_action * k.sgn() * (t < k.abs())))
-        out |= ~env.state_space.contains(x)
-        when = torch.where(~out & (env.region(x)[:, 0] == UNSAFE), when.clamp(max=t), when)
-    when = when.reshape(len(state), -1)
+    when = first_entry(env, x, lambda t: k.sgn() * (t < k.abs())).reshape(len(state), -1)
     chosen = turns[when.argmin(1)].sgn()[:, None] * env.max_action
     ahead = torch.stack([state[:, 2].cos(), state[:, 2].sin()], 1)
     aside = ahead[:, :1] * -state[:, 1:2] - ahead[:, 1:] * -state[:, :1]
@@ -82,19 +90,15 @@ def towards_obstacle(env: Any, state: Tensor, held: Tensor, generator: torch.Gen
 
 
 def reachable(env: Any, state: Tensor) -> int:
-    """From how many states a car can be steered into U at all: any turn for a while, any for another while, and then any."""
-    whiles = range(0, TURNS - TURNS // 4, 3)
-    plans = torch.tensor(list(itertools.product((-1.0, 0.0, 1.0), whiles, (-1.0, 0.0, 1.0), whiles, (-1.0, 0.0, 1.0))))
-    entered = 0
+    """From how many states one of PLANS steers a car into U before it leaves."""
+    plans, entered = torch.tensor(PLANS), 0
     for some in state.split(50):
-        x, (first, until, second, longer, third) = some.repeat_interleave(len(plans), 0), plans.repeat(len(some), 1).T
-        out = hit = torch.zeros(len(x), dtype=torch.bool)
-        for t in range(LOOKAHEAD):
-            turn = torch.where(t < until, first, torch.where(t < until + longer, second, third))
-            x = env.wrap(env.dynamics(x, env.max_action * turn[:, None]))
-            out = out | ~env.state_space.contains(x)
-            hit = hit | (~out & (env.region(x)[:, 0] == UNSAFE))
-        entered += int(hit.reshape(len(some), -1).any(1).sum())
+        first, until, second, longer, third = plans.repeat(len(some), 1)[..., None].unbind(1)
+        when = first_entry(
+            env, some.repeat_interleave(len(plans), 0),
+            lambda t, f=first, u=until, s=second, n=longer, e=third: torch.where(t < u, f, torch.where(t < u + n, s, e)),
+        )  # fmt: skip
+        entered += int((when < LOOKAHEAD).reshape(len(some), -1).any(1).sum())
     return entered
 
 
@@ -165,7 +169,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         shown = agent.barrier(encode_states(agent, env, start, draw=noisy(env.draw, given.noise)))[:, 0] <= 0.0
         print(f"Starts that this camera shows in {{B <= 0}}: {int(shown.sum()):,} of {len(start):,}\n")
     if given.agent == "quadruped" and given.only in (None, "adversarial"):
-        print(f"Starts from which any of a thousand plans enters U before the car leaves: {reachable(env, start):,} of {len(start):,}\n")
+        print(f"Starts from which one of {len(PLANS):,} plans enters U before the car leaves: {reachable(env, start):,} of {len(start):,}\n")
     print("| Actions | filter | episodes that enter U | hit | fallen | steps with an intervention | mean deviation [half ranges] |")
     print("|---|---|---|---|---|---|---|")
     policies = {"random": random_actions, "adversarial": ADVERSARIAL[given.agent], "own": None}

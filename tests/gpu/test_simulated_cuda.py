@@ -64,7 +64,8 @@ def test_a_run_that_began_on_a_gpu_goes_on_without_one(environment, tmp_path):
     assert experiment.trainer.collected_frames == 512
 
 
-def test_what_needs_a_gpu_works_on_it(environment):
-    found = python(environment, "-m", "pytest", "-p", "simulated_cuda", "-p", "no:cacheprovider", "-m", "gpu and not slow", "-rs", "tests")
+@pytest.mark.parametrize("chosen", ["gpu and not slow", pytest.param("gpu and slow", marks=pytest.mark.slow)])
+def test_what_needs_a_gpu_works_on_it(environment, chosen):
+    found = python(environment, "-m", "pytest", "-p", "simulated_cuda", "-p", "no:cacheprovider", "-m", chosen, "-rs", "tests")
     assert found.returncode == 0, found.stdout[-8000:]
     assert "CUDA device" not in found.stdout, found.stdout[-2000:]  # the reason for which they are skipped

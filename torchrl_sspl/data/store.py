@@ -15,13 +15,11 @@ from torchrl.data.replay_buffers import RoundRobinWriter, Sampler, Storage, Tens
 from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.data.frames import FrameBank
 from torchrl_sspl.data.labels import Labels
-from torchrl_sspl.data.trees import stand_in
 from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, EmptyRegionError, ShapeError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 _FILE = "transitions.safetensors"
 _BLOCK = 32768  # frames per block of the bank, at most
-stand_in()  # before a sampler that draws by priority is made for a store
 _NAMES = {UNLABELLED: "unlabelled", SAFE: "safe", UNSAFE: "unsafe"}
 
 

@@ -122,7 +122,7 @@ def certify(
 
     Example:
         >>> from torchrl_sspl.modules.agent import load
-        >>> certificate = certify(load("pendulum"), None, level=0.0, budget=Budget(boxes=1000))  # 50,000 boxes prove all of it
+        >>> certificate = certify(load("pendulum"), None, level=0.0, budget=Budget(boxes=1000))  # 40,000 boxes prove all of it
         >>> {s.name: s.holds for s in certificate.layers["deterministic"].statements if s.name in ("Lipschitz constant", "invariance")}
         {'Lipschitz constant': True, 'invariance': False}
     """
