@@ -54,6 +54,7 @@ def test_answers_are_of_the_kind_of_the_question_and_the_later_value_counts():
     torch.testing.assert_close(priorities[torch.tensor([1, 2])], torch.tensor([2.0, 0.0]))
     assert isinstance(priorities.scan_lower_bound(np.array([0.1])), np.ndarray)
     assert priorities.scan_lower_bound(torch.tensor([0.1, 9.0])).tolist() == [0, 4]
+    assert [priorities.scan_lower_bound(mass) for mass in (0.0, 1.0, 3.0, 3.5)] == [0, 0, 1, 3], "a sum that is met is enough"
     with pytest.raises(IndexError):
         priorities[4] = 1.0
     assert [copy.deepcopy(priorities)[1], pickle.loads(pickle.dumps(priorities))[1]] == [2.0, 2.0]
