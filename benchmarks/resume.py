@@ -69,10 +69,10 @@ class Training:
             command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # in the background of a shell it is ignored
         )  # fmt: skip
-        self.saved = [time.time()]  # when it began, and when each checkpoint was written
+        self.saved = [time.time()]  # when it began, and when each checkpoint or result was written
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
-        threading.Thread(target=self._watch, args=(folder / "checkpoints",), daemon=True).start()
+        threading.Thread(target=self._watch, args=(folder,), daemon=True).start()
 
     def _read(self) -> None:
         assert self.process.stderr is not None
@@ -84,18 +84,20 @@ class Training:
 
     def _watch(self, folder: Path) -> None:
         while self.process.poll() is None:
-            found = [at for at in (_written(path) for path in folder.glob("*")) if at > self.saved[-1]]
+            kept = [*folder.glob("checkpoints/*"), *folder.glob("unfinished/*/*.pt")]
+            found = [at for at in (_written(path) for path in kept) if at > self.saved[-1]]
             self.saved += sorted(found)[-1:]
             time.sleep(0.1)
 
     @property
     def at_risk(self) -> float:
-        """Longest time between two checkpoints, or before the first one, in s: what a kill can cost."""
+        """Longest time in which nothing was written, from the beginning to the end of the process, in s: what a kill can cost."""
         return max((b - a for a, b in itertools.pairwise(self.saved)), default=float("nan"))
 
     def finish(self) -> Seen:
         """Wait for its end."""
         code = self.process.wait()
+        self.saved.append(time.time())
         self._reader.join()
         if code:
             raise SystemExit(f"the training ended with code {code}:\n{self.seen.text[-3000:]}")
@@ -177,7 +179,7 @@ def main(words: list[str]) -> int:
     whole = untouched.finish()
     print(
         f"not interrupted: {len(whole.phases)} phases ({', '.join(whole.phases)}), {max(whole.times.values()):.0f} s, "
-        f"at most {untouched.at_risk:.1f} s between two checkpoints", flush=True,
+        f"at most {untouched.at_risk:.1f} s in which nothing was written", flush=True,
     )  # fmt: skip
     plan, equal, struck, bad = moments(whole, kills, draw), 0, 0, 0
     for run in range(runs):

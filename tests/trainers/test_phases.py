@@ -14,10 +14,12 @@ from tensordict import TensorDict
 from tiny import TINY
 from torch import nn
 
+import torchrl_sspl.journal as journal_module
 from torchrl_sspl.configs import compose
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.experiments.run import Experiment
+from torchrl_sspl.journal import Entry
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.trainers import (
@@ -88,6 +90,37 @@ def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkp
     assert resumed.work.level == whole.work.level
     assert resumed.work.source.budget == whole.work.source.budget
     assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
+
+
+@pytest.mark.parametrize("results", [3, 11, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 4, 6, 8, 16)]])
+def test_what_a_phase_without_steps_had_found_is_not_found_again(tmp_path, uninterrupted, monkeypatch, results):
+    """Transitions, latents, episodes and proofs: killed when one of them is written, a training goes on from there, bit for bit."""
+    whole, expected = uninterrupted
+    monkeypatch.setattr(journal_module, "_SHORT", 0.0)
+    monkeypatch.setattr(journal_module, "_EVERY", 0.0)
+    save, read, left, taken = Entry.save, Entry.saved, [results], []
+
+    def save_and_die(self, value, *, complete=False):
+        save(self, value, complete=complete)
+        left[0] -= 1
+        if left[0] == 0:
+            raise Killed
+
+    def counted(self):
+        taken.append(read(self) is not None)
+        return read(self)
+
+    monkeypatch.setattr(Entry, "save", save_and_die)
+    with pytest.raises(Killed):
+        experiment(tmp_path, EVERY_STEP).train()
+    monkeypatch.setattr(Entry, "saved", counted)
+    resumed = experiment(tmp_path, EVERY_STEP)
+    assert_same(resumed.train(), expected)
+    assert any(taken)
+    assert resumed.work.checks == whole.work.checks
+    assert resumed.work.source.budget == whole.work.source.budget
+    assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
+    assert not (tmp_path / journal_module.FOLDER).exists()
 
 
 @pytest.mark.parametrize("checkpoints", [3, 15])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from dataclasses import replace
 from typing import Any
 
@@ -17,7 +16,7 @@ from torchrl_sspl.evaluation import Episodes
 from torchrl_sspl.lipschitz import SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.sets import UNSAFE
-from torchrl_sspl.trainers import CheckRound, Phase, Phases, PlaceLevel, Source, Workspace, selection
+from torchrl_sspl.trainers import CheckRound, PlaceLevel, Source, Workspace
 from torchrl_sspl.trainers.selection import _HeldOut
 
 CONFIG = SynthesisConfig(check_episodes=6, check_horizon=2, guard=0.02, leave_share=0.0, return_share=0.5)
@@ -137,41 +136,6 @@ def test_where_no_level_passes_the_reason_is_that_of_zero_and_nothing_is_kept():
     assert work.level == 0.0
 
 
-def test_levels_that_were_proved_before_an_interruption_are_not_proved_again(monkeypatch):
-    asked: list[float] = []
-
-    def premise(agent) -> float:
-        if len(asked) == 2 and interrupting:
-            raise KeyboardInterrupt
-        asked.append(float(agent.barrier(torch.zeros(1, 2))))
-        return 0.0
-
-    monkeypatch.setattr(selection, "premise", premise)
-    config, interrupting = replace(CONFIG, cover_share=0.5), True
-    work = workspace(config)
-    work.save = lambda: saved.update(copy.deepcopy(work.state_dict()))
-    saved: dict[str, Any] = {}
-    with pytest.raises(KeyboardInterrupt):
-        judged(held_out(), work)
-    resumed, interrupting = workspace(config), False
-    resumed.load_state_dict(saved)
-    judged(held_out(), resumed)
-    assert len(asked) == len(set(asked)) == 6
-    assert resumed.checks == judged(held_out(), workspace(config)).checks
-    assert len(asked) == 12, "another workspace knows nothing"
-
-
-def test_what_one_phase_knew_is_not_taken_for_what_the_next_one_asks():
-    class Ask(Phase):
-        def run(self, work):
-            found.append(self.once(work, "a number", lambda: float(self.number)))
-            found.append(self.once(work, "a number", lambda: -1.0))
-
-    work, found = workspace(), []
-    Phases([Ask(0), Ask(1)], work).run()
-    assert found == [0.0, 0.0, 1.0, 1.0]
-
-
 def test_an_empty_set_is_called_so():
     work = judged(None)
     assert (work.checks[0].passed, work.checks[0].reason, work.checks[0].size) == (False, "the set is empty", 0.0)
@@ -189,7 +153,7 @@ def test_pictures_are_encoded_once_for_all_levels(monkeypatch):
 
 def test_where_training_changes_its_pictures_those_of_u_are_held_out_changed_too():
     plain, changed = workspace(), workspace()
-    changed.source.augmentation = Augmentation(share=1.0, noise=40.0)
+    changed.source.changes = Augmentation(share=1.0, noise=40.0)
     one, other = (CheckRound(0)._pictures(work, work.agent(0.0)) for work in (plain, changed))
     assert one.changed is None
     assert torch.equal(other.unsafe, one.unsafe)

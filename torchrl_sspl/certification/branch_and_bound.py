@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -22,10 +23,12 @@ from torchrl_sspl.certification.graph import Graph
 from torchrl_sspl.certification.half_spaces import clip, programme
 from torchrl_sspl.certification.propagation import Enclosure, LinearBound
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.journal import Entry
 
 #: What a bound or a witness must be better by before it decides; far above the rounding of float64.
 SLACK = 1e-6
 _BATCH = 1024  # boxes at a time
+_PLAIN = ("lower", "witness", "count", "deepest", "close")  # of where a search stands
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,11 @@ class Problem:
         if self.floor is not None:
             inside &= barrier >= self.floor + SLACK
         return inside
+
+    def about(self) -> list[Any]:
+        """What tells it from other problems about the same networks."""
+        numbers = [self.level, self.floor, self.combine, self.lipschitz, self.inner, self.error]
+        return [self.low, self.high, self.rows, self.barrier_weight, self.constant, *numbers]
 
 
 @dataclass
@@ -330,20 +338,35 @@ def maximise(
     """
     budget = budget or Budget()
     search = _Search(problem, threshold, tolerance, confirm, seek)
-    search.lower, search.witness = _attack(problem) if seek else (-math.inf, None)
+    entry = Entry("maximise", problem.about(), threshold, tolerance, budget, tight, seek)
+    kept = entry.saved()
+    if kept is None:
+        search.lower, search.witness = _attack(problem) if seek else (-math.inf, None)
+    elif "status" in kept:
+        return Outcome(**kept)
+    else:
+        search.load_state_dict(kept)
+
+    def ended(status: str) -> Outcome:
+        outcome = search.outcome(status)
+        entry.save(vars(outcome), complete=True)
+        return outcome
+
     bar = tqdm(total=1.0, disable=not progress, bar_format="{l_bar}{bar}| {n:.4f} of the domain [{elapsed}<{remaining}]")
     with bar:
         if search.refuted():
-            return search.outcome("refuted")
+            return ended("refuted")
         while len(search.left):
             if search.count >= budget.boxes or search.seconds() >= budget.seconds:
-                return search.outcome("undecided")
+                return ended("undecided")
             if search.advance(min(_BATCH, budget.boxes - search.count), tight):
-                return search.outcome("refuted")
+                return ended("refuted")
+            if entry.due:
+                entry.save(search.state_dict())
             if progress:
                 bar.n = max(0.0, 1.0 - search.left.volume())
                 bar.refresh()
-    return search.outcome("undecided" if search.close else "proved")
+    return ended("undecided" if search.close else "proved")
 
 
 @dataclass
@@ -372,6 +395,18 @@ class _Search:
 
     def seconds(self) -> float:
         return time.monotonic() - self.start
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where it stands."""
+        plain = {name: getattr(self, name) for name in _PLAIN}
+        return {**plain, "seconds": self.seconds(), "boxes": {k: v for k, v in vars(self.left).items() if k != "domain"}}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Goes on from what ``state_dict`` returned."""
+        for name in _PLAIN:
+            setattr(self, name, state[name])
+        self.start = time.monotonic() - state["seconds"]
+        vars(self.left).update(state["boxes"])
 
     def refuted(self) -> bool:
         if self.threshold is None or self.witness is None or not self.lower > self.threshold + SLACK:

@@ -185,6 +185,8 @@ class SynthesisConfig:
     rim_draws: int = _option(5, "see rim_transitions.")
     exploration: float = _option(0.15, "standard deviation of the exploration in further rounds, as a share of the "
         "largest action.")
+    steady_steps: int = _option(0, "steps of the encoder alone, before all others, after which pictures changed as in augmentation show "
+        "what unchanged ones do; the data stay unchanged then. 0: augmentation changes the data.")
     dynamics_steps: int = _option(1500, "optimiser steps of the refit of the latent dynamics.")
     unsafe_weight: float = _option(1.0, "weight of transitions that start in U in the refit of the dynamics; below 1 "
         "where the pictures there are not worth the networks' capacity (a robot in front of the obstacle that it stands on).")
@@ -338,6 +340,11 @@ class Config:
             raise ConfigError(
                 f"expected collector.init_random_frames of at most trainer.total_frames={self.trainer.total_frames}, received "
                 f"{c.init_random_frames}: nothing would be learnt"
+            )
+        if self.synthesis.steady_steps > 0 and not (self.augmentation.share > 0 and self.synthesis.enabled):
+            raise ConfigError(
+                f"expected augmentation.share > 0 and synthesis.enabled=true with synthesis.steady_steps={self.synthesis.steady_steps}, "
+                f"received {self.augmentation.share} and {self.synthesis.enabled}: there is nothing to be steady under"
             )
         if self.labels.choose and not self.synthesis.enabled:
             raise ConfigError(f"expected labels.choose=0 with synthesis.enabled=false, received {self.labels.choose}: pictures are chosen on its latents")

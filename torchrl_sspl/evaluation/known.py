@@ -18,6 +18,7 @@ from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, Camera, Controller, as_controller
 from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, quantiles, share
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.journal import Entry
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules.agent import Agent, on_host
 from torchrl_sspl.sets import Region
@@ -38,12 +39,17 @@ def encode_states(
         augmentation: changes these frames, both of a state as seen by one camera.
     """
     agent, draw = on_host(agent), draw or env.draw
-    latents = [torch.zeros(0, agent.latent_dim)]
-    for position, part in enumerate(state.split(CHUNK) if len(state) else ()):
+    entry = Entry("latents", state)
+    latents = entry.saved() or [torch.zeros(0, agent.latent_dim)]
+    parts = list(enumerate(state.split(CHUNK) if len(state) else ()))
+    for position, part in parts[len(latents) - 1 :]:
         frames = torch.cat([draw(env.previous_state(part)), draw(part)])
         if augmentation is not None:
             frames = augmentation(frames, torch.arange(len(part)).repeat(2), position)
         latents.append(agent.encode(torch.cat(frames.chunk(2), dim=-3)))
+        if entry.due:
+            entry.save(latents)
+    entry.save(latents, complete=True)
     return torch.cat(latents)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, fields
+from functools import partial
 from typing import Any
 
 import torch
@@ -12,11 +13,21 @@ from torchrl.envs import EnvBase
 from tqdm import tqdm
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.evaluation.controllers import _NONE, CHUNK, Camera, Controller, Decision, as_controller
+from torchrl_sspl.evaluation.controllers import (
+    _NONE,
+    CHUNK,
+    AgentController,
+    Camera,
+    Controller,
+    Decision,
+    as_controller,
+)
 from torchrl_sspl.evaluation.measurements import Draw
+from torchrl_sspl.journal import Entry
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 Watch = Callable[[Decision, Tensor], None]
+_PART = 250  # episodes of an agent that are kept together in a journal
 #: Events of an episode in full physics, and the entry of ``info`` that tells each.
 EVENTS = {"entered": "unsafe", "hit": "contact", "fallen": "fallen", "left": "left"}
 
@@ -148,7 +159,11 @@ def simulate(
     poses: Sequence[Any] = [None] * int(episodes or 0) if start is None else torch.as_tensor(start).tolist()
     bar = tqdm(poses, desc=label, unit="episode", disable=label is None, leave=False)
     seeds = [None if seed is None else seed + k for k in range(len(poses))]
-    found = [_in_world(acts, env, p, horizon, seeds[k], k < film, watch) for k, p in enumerate(bar)]
+    found = []
+    for k, pose in enumerate(bar):
+        walk = partial(_in_world, acts, env, pose, horizon, seeds[k], k < film, watch)
+        # Without a seed the world goes on from where the episode before has left it.
+        found.append(walk() if seeds[k] is None else _kept(acts, watch, walk, pose, seeds[k], horizon, k < film))
     return found[0].joined(*found[1:])
 
 
@@ -201,11 +216,41 @@ def _asked(acts: Controller, last: bool) -> Callable[..., Decision]:
 def _from_states(
     acts: Controller, env: Any, start: Tensor, horizon: int, draw: Draw, film: int, label: str | None, watch: Watch | None
 ) -> Episodes:
+    size = len(start) if getattr(acts, "streams", False) else CHUNK  # whose pictures are held
+    size = _PART if _alone(acts, watch) else size
+    if len(start) <= size:
+        run = partial(_side_by_side, acts, env, start, horizon, draw, film, label, watch)
+        return _kept(acts, watch, run, start, horizon, film)
+    found = list[Episodes]()
+    with tqdm(total=len(start), desc=label, unit="episode", disable=label is None, leave=False) as bar:
+        for k, part in enumerate(start.split(size)):
+            found.append(_from_states(acts, env, part, horizon, draw, film - k * size, None, watch))
+            bar.update(len(part))
+    return found[0].joined(*found[1:])
+
+
+def _alone(acts: Controller, watch: Watch | None) -> bool:
+    """Whether an agent acts by itself: no episode depends on others then."""
+    return watch is None and isinstance(acts, AgentController) and acts.driver is None
+
+
+def _kept(acts: Controller, watch: Watch | None, simulated: Callable[[], Episodes], *about: Any) -> Episodes:
+    """Episodes, from the open journal where it has them."""
+    if not _alone(acts, watch):
+        return simulated()
+    entry = Entry("episodes", *about)
+    kept = entry.saved()
+    if kept is not None:
+        return Episodes(**kept)
+    found = simulated()
+    entry.save(vars(found), complete=True)
+    return found
+
+
+def _side_by_side(
+    acts: Controller, env: Any, start: Tensor, horizon: int, draw: Draw, film: int, label: str | None, watch: Watch | None
+) -> Episodes:
     streams = getattr(acts, "streams", False)
-    if len(start) > CHUNK and not streams:  # pictures of a thousand episodes at a time
-        parts = start.split(CHUNK)
-        found = [_from_states(acts, env, x, horizon, draw, film - k * CHUNK, label, watch) for k, x in enumerate(parts)]
-        return found[0].joined(*found[1:])
     if acts.reads not in ("pixels", "state"):
         raise ConfigError(
             f"controller.reads: expected 'pixels' or 'state' on {type(env).__name__}, received '{acts.reads}'"

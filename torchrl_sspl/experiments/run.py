@@ -22,7 +22,7 @@ from torchrl.trainers import LRSchedulerHook
 from tqdm import tqdm
 
 from torchrl_sspl.certification.branch_and_bound import Budget
-from torchrl_sspl.certification.certificate import Certificate
+from torchrl_sspl.certification.certificate import Certificate, weights_digest
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.configs.schema import Config, LabelsConfig
 from torchrl_sspl.data import Augmentation, Labels, TransitionStore
@@ -40,6 +40,7 @@ from torchrl_sspl.experiments.description import describe, differences
 from torchrl_sspl.experiments.own_systems import advice, check_encoder, check_factory
 from torchrl_sspl.files import RunDirectory, write
 from torchrl_sspl.interrupts import interruptible
+from torchrl_sspl.journal import FOLDER, journal
 from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.modules.agent import Agent, agent_directory, build_encoder, call_with, load
@@ -78,7 +79,8 @@ def _alone(method: Callable[..., Any]) -> Any:
 
     @wraps(method)
     def wrapped(self: Experiment, **options: Any) -> Any:
-        with self._claim.held(), interruptible(lambda: f"what is saved stays in {self.directory}; the same command resumes from there"):
+        say = f"what is saved stays in {self.directory}; the same command resumes from there"
+        with self._claim.held(), interruptible(lambda: say), journal(self.directory, "run"):
             return method(self, **options)
 
     return wrapped
@@ -128,7 +130,8 @@ class Experiment:
         self.loss = self._loss(self.encoder, self.dynamics, self.barrier, self.policy)
         self.logger = make_logger(config.logger.kind, config.logger.kind, self.directory, project=config.logger.project)
         # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
-        self.augmentation = Augmentation(**vars(config.augmentation), seed=config.seed) if config.augmentation.share else None
+        self.changes = Augmentation(**vars(config.augmentation), seed=config.seed) if config.augmentation.share else None
+        self.augmentation = None if config.synthesis.steady_steps else self.changes  # of the data
         self.labels = Labels(**vars(config.labels), seed=config.seed) if config.labels != LabelsConfig() else None
         self.store = TransitionStore(
             config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=self.augmentation, labels=self.labels
@@ -199,7 +202,7 @@ class Experiment:
         source = Source(
             self.make_env, self.encoder, store=self.store, starts=c.starts,
             steps=self.config.synthesis.episode_steps or c.max_frames_per_traj,
-            envs=256 if self.known else c.envs, seed=seed, augmentation=self.augmentation, labels=self.labels,
+            envs=256 if self.known else c.envs, seed=seed, augmentation=self.augmentation, changes=self.changes, labels=self.labels,
         )  # fmt: skip
         body = self.config.to_dict()
         body.pop("out_dir")
@@ -304,6 +307,7 @@ class Experiment:
             self._same_run()
             self.trainer.resume()
         else:
+            shutil.rmtree(self.directory / FOLDER, ignore_errors=True)
             for path in () if rotation is None else rotation.checkpoints():
                 rotation._remove_atomically(path)
             (self.directory / "log.jsonl").unlink(missing_ok=True)
@@ -318,7 +322,8 @@ class Experiment:
             ) from error
         agent = self.agent()
         agent.description["stop_reason"] = self.stop_reason()
-        agent.description["tolerated_error"] = premise(agent, budget=Budget(seconds=self.config.evaluation.certificate_seconds))
+        with journal(self.directory, "premise", weights_digest(agent.state_dict())):
+            agent.description["tolerated_error"] = premise(agent, budget=Budget(seconds=self.config.evaluation.certificate_seconds))
         agent.save(self.directory / "agent")
         return agent
 
@@ -401,11 +406,13 @@ class Experiment:
         trained = not self.config.agent
         agent = (self.train(resume=resume) if trained else load(self.config.agent)).to(self.device)
         seconds = self.trainer.clock.seconds  # before anything is measured
-        evaluations = self.evaluate(agent)
-        if trained:
-            evaluations["own"].add(Measurement("training_minutes", seconds / 60, "min", note="wall clock, data included"))
-            certificate: Certificate | None = self.certify(agent)
-        else:
+        certificate: Certificate | None = None
+        with journal(self.directory, "evaluation", weights_digest(agent.state_dict()), self.config.to_dict()):
+            evaluations = self.evaluate(agent)
+            if trained:
+                evaluations["own"].add(Measurement("training_minutes", seconds / 60, "min", note="wall clock, data included"))
+                certificate = self.certify(agent)
+        if not trained:
             self.trainer.collector.shutdown()
             beside = agent_directory(self.config.agent) / CERTIFICATE_FILE
             certificate = Certificate.load(beside) if beside.is_file() else None

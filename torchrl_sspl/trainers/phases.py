@@ -18,10 +18,12 @@ import torch
 from torch import Tensor, nn
 from torchrl.trainers import Trainer, TrainerHookBase
 
+from torchrl_sspl.certification.certificate import weights_digest
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.files import append
+from torchrl_sspl.journal import journal
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.modules.observer import completed, filtered, gain_matrix
@@ -31,7 +33,7 @@ from torchrl_sspl.trainers.source import Source
 
 LOG_FILE = "log.jsonl"
 _MOST_ACTIONS = 729  # in the grid that is tried at every latent
-_PLAIN = ("kept_share", "logged_round", "level", "warnings", "skip", "known")  # of a workspace's state, what JSON can write
+_PLAIN = ("kept_share", "logged_round", "level", "warnings", "skip")  # of a workspace's state, what JSON can write
 
 
 def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
@@ -206,6 +208,7 @@ class Workspace:
         self.gain = gain_matrix(self.config.gain, self.latent_dim, self.seen_dim)
         self.latents: dict[str, Tensor] = {}
         self.counterexamples = torch.zeros(0, self.latent_dim)
+        self.changes = torch.zeros(0, self.latent_dim)  # of latents, by changes of their pictures that do not matter
         self.teacher_policy: nn.Module | None = None  # the policy that TeachPolicy left; targets are made of it
         self.kept_share: float | None = None  # of the latents outside U, what can be kept under the observed errors
         self.logged_round: int | None = None  # of which this is in the log
@@ -215,8 +218,6 @@ class Workspace:
         self.warnings: list[str] = []
         self.skip = False  # nothing more can be done on these latents
         self.cache: dict[str, Any] = {}  # what a phase can compute again
-        self.known: dict[str, float] = {}  # what it should not; see Phase.once
-        self.save: Callable[[], None] = lambda: None  # a checkpoint, if it is time for one
         self.begin()
 
     def begin(self) -> None:
@@ -276,6 +277,10 @@ class Workspace:
         level, nets = self.level if level is None else level, self.networks.values()
         return Agent.from_networks(self.encoder, *nets, level=level, description=self.description, **self.acts())
 
+    def digest(self) -> str:
+        """Of the weights of all networks as they are."""
+        return weights_digest({f"{k}.{name}": v for k, net in (("nets", self.networks), ("encoder", self.encoder)) for name, v in net.state_dict().items()})
+
     def acts(self) -> dict[str, Any]:
         """How the agent acts on its latents: the observer's gain, and what the policy chooses from."""
         s, scale = self.config, self.action_scale
@@ -326,6 +331,7 @@ class Workspace:
             "networks": self.networks.state_dict(),
             "latents": dict(self.latents),
             "counterexamples": self.counterexamples,
+            "changes": self.changes,
             "teacher_policy": None if self.teacher_policy is None else self.teacher_policy.state_dict(),
             "best": self.best,
             "plain": json.dumps(plain),
@@ -337,6 +343,7 @@ class Workspace:
         state = _own(state)
         self.networks.load_state_dict(state["networks"])
         self.latents, self.counterexamples, self.best = dict(state["latents"]), state["counterexamples"], state["best"]
+        self.changes = state["changes"]
         if state["teacher_policy"] is not None:
             self.teacher_policy = copy.deepcopy(self.policy).requires_grad_(False)
             self.teacher_policy.load_state_dict(state["teacher_policy"])
@@ -362,6 +369,7 @@ class Phase:
     """
 
     name = "phase"
+    pictures = False  # whether it needs those of the joint training; then checkpoints hold them until it is done
 
     def __init__(self, number: int = 0) -> None:
         self.number = number
@@ -373,14 +381,6 @@ class Phase:
     def run(self, work: Workspace) -> None:
         """Do it; after an interruption it is called again, with ``work.loop`` where it was."""
         raise NotImplementedError
-
-    @staticmethod
-    def once(work: Workspace, name: str, compute: Callable[[], float]) -> float:
-        """A number that takes long, kept in checkpoints until this phase is done: after an interruption it is not computed again."""
-        if name not in work.known:
-            work.known[name] = compute()
-            work.save()
-        return work.known[name]
 
 
 class Phases(TrainerHookBase):
@@ -410,6 +410,11 @@ class Phases(TrainerHookBase):
         return self.work is not None and (self.done > 0 or self.work.loop.step > 0)
 
     @property
+    def needs_pictures(self) -> bool:
+        """Whether pictures of the joint training are needed to go on."""
+        return any(phase.pictures for phase in self.phases[self.done :])
+
+    @property
     def steps(self) -> int:
         """Optimiser steps of all phases."""
         return sum(phase.size(self.work) for phase in self.phases)
@@ -433,7 +438,7 @@ class Phases(TrainerHookBase):
         if not self.resumed:
             self._save(force_save=True)  # the joint training is done
             work.begin()
-        work.loop.tick, work.save = self._tick, self._save
+        work.loop.tick = self._tick
         own_bar = self.bar is None
         if own_bar:
             self.bar = Progress(self.steps, self.steps_done, shown=self.progress, out_dir=work.out_dir)
@@ -445,9 +450,9 @@ class Phases(TrainerHookBase):
             work.logged_step = base + self.steps_done
             self._show(phase, rounds)
             if not work.skip:
-                phase.run(work)
+                with journal(work.out_dir, f"{phase.name}-{phase.number}", work.digest()):
+                    phase.run(work)
             work.loop.restart()
-            work.known.clear()
             self.done += 1
             self.bar.move(before + self.steps_done)
             self._tell(phase)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import Any
 
 import torch
@@ -101,7 +100,7 @@ class CheckRound(Phase):
         apart = [v for v in levels if all(found <= most for _, found, most in self._mixed(work, held_out, v))]
         for level in apart[::_STEP][:_TRIED]:
             agent = work.agent(level)
-            agent.description["tolerated_error"] = tolerated = self.once(work, f"premise at {level}", partial(premise, agent))
+            agent.description["tolerated_error"] = tolerated = premise(agent)
             fresh = self._held_out(work, agent) if tolerated > 0 else None
             if fresh is None:
                 continue
@@ -135,8 +134,8 @@ class CheckRound(Phase):
             env, generator = source.env, torch.Generator().manual_seed(spawn(work.seed, "checks", self.number))
             in_unsafe = env.sample_states(min(8 * n, _UNSAFE_DRAWS), generator, region=env.unsafe_set)
             unsafe, changed = encode_states(agent, env, in_unsafe), None
-            if source.augmentation is not None:
-                cameras = source.augmentation.with_seed(spawn(work.seed, "checks", 2000 + self.number))
+            if source.changes is not None:
+                cameras = source.changes.with_seed(spawn(work.seed, "checks", 2000 + self.number))
                 changed = encode_states(agent, env, in_unsafe, augmentation=cameras)
             safe = encode_states(agent, env, env.sample_states(n, generator, region=env.safe_set))
             states = env.sample_states(3 * n, generator, region=source.outside_unsafe)

@@ -17,6 +17,7 @@ from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.data.store import continues
 from torchrl_sspl.direction import direction_of
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.journal import Entry
 from torchrl_sspl.modules import LatentObserver, Predict
 from torchrl_sspl.modules.salad import make_rollout_policy
 from torchrl_sspl.seeds import spawn
@@ -63,6 +64,7 @@ class Source:
         envs: environments stepped together.
         seed: seed of all collections.
         augmentation: changes the pictures of what is collected anew; the store's are as they are.
+        changes: of pictures, that should not matter to what comes out; by default ``augmentation``.
         labels: how many labels there are in all; what is collected anew gets those that the store has left.
 
     Source: paper Algorithm 1 (D grows by rollouts of the policy); deviation: labels of the rollouts are used too.
@@ -79,10 +81,12 @@ class Source:
         envs: int = 256,
         seed: int = 0,
         augmentation: Augmentation | None = None,
+        changes: Augmentation | None = None,
         labels: Labels | None = None,
     ) -> None:
         self.make_env, self.encoder, self.store, self.labels = make_env, getattr(encoder, "module", encoder), store, labels
         self.starts, self.steps, self.envs, self.seed, self.augmentation = list(starts), steps, envs, seed, augmentation
+        self.changes = augmentation if changes is None else changes
         self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
 
     @cached_property
@@ -189,6 +193,12 @@ class Source:
         parts = list[Latents]()
         for k, size in enumerate(c.numel() for c in torch.arange(n).split(_CHUNK)):
             seed = spawn(self.seed, "rounds", 1000 * index + k)
+            entry = Entry("transitions", seed, size)
+            kept = entry.saved()
+            if kept is not None:
+                self.budget = kept["budget"]
+                parts.append(kept["latents"])
+                continue
             changes = None if self.augmentation is None else self.augmentation.with_seed(seed)
             labels = None
             if self.labels is not None:
@@ -197,6 +207,7 @@ class Source:
             draw(env, store, seed)
             self.count(store)
             parts.append(self._encode(store, torch.arange(len(store))))
+            entry.save({"latents": parts[-1], "budget": self.budget}, complete=True)
         if not isinstance(env, SafetyEnv):
             env.close()
         return {k: torch.cat([p[k] for p in parts]) for k in parts[0]}

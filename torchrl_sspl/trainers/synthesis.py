@@ -37,6 +37,7 @@ from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.asking import choose_and_spread
 from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
+from torchrl_sspl.trainers.steady import SteadyEncoder
 from torchrl_sspl.trainers.targets import observed_errors, off_manifold, remembered, successors, targets, uniform
 from torchrl_sspl.viability.cloud import (
     reach_times,
@@ -55,6 +56,7 @@ _STARTS = 1024  # latents from which they are climbed to
 _BESIDE = 0.05  # barrier value up to which these may lie outside the set
 _INSIDE = 0.02  # ... up to which what lies outside counts as a counterexample, too
 _NEARLY = 0.01  # ... below zero from which on a successor is nearly one
+_RARE = 1.5  # times as far as changes of pictures were seen to move latents: rare ones move them farther
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
@@ -70,6 +72,10 @@ class Gather(Phase):
     """
 
     name = "gather"
+
+    def __init__(self, number: int = 0) -> None:
+        super().__init__(number)
+        self.pictures = number == 0
 
     def run(self, work: Workspace) -> None:
         s, source = work.config, work.source
@@ -291,6 +297,7 @@ class FineTune(_Training):
             worst_coeff=1.0, worst_fraction=0.02, off_manifold_coeff=1.0,
         )  # fmt: skip
         target = self._target(work)
+        of_unsafe = self._target(work).select_out_keys("loss_unsafe")
         depth = table["barrier_target"][:, 0]
         calm = (depth < 0.5 * depth.min().clamp_max(0.0)).nonzero()[:, 0]  # nearer to the border safety needs the action
         change = ActionChangeLoss(work.dynamics, work.policy, action_scale=work.action_scale)
@@ -313,6 +320,9 @@ class FineTune(_Training):
                 asked = self._with_counterexamples(work, asked)
             terms = condition(asked)
             terms.update(target(table[torch.cat(drawn)]))
+            if len(work.changes):
+                near = table[unsafe[nearest][pick(len(nearest), s.batch // 2)]]
+                terms["loss_unsafe"] += of_unsafe(near.set("latent", _as_changed(work, near["latent"])))["loss_unsafe"]
             terms.update(self.more(work, rim["latent"]))
             if s.change_coeff > 0 and len(calm):
                 steady = change(table[calm[pick(len(calm), s.batch)]])
@@ -509,6 +519,11 @@ class Settle(Tighten):
         work.loop(self.size(work), self.rates(work), step)
 
 
+def _as_changed(work: Workspace, latent: Tensor) -> Tensor:
+    """Latents ``(n, p)`` moved by what changes of pictures were seen to do, and somewhat farther."""
+    return within(latent + _RARE * work.changes[work.loop.pick(len(work.changes), len(latent))], work.direction)
+
+
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
     """The phases of every round.
 
@@ -524,9 +539,10 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
     """
     teach = [TeachPolicy] if config.teacher == "value" else []
     tighten = [Tighten] if config.tolerated_error > 0 else []
+    steady = [SteadyEncoder(0)] if config.steady_steps else []
     after = [Settle] if config.grid else [SteerPolicy, FineTune, *tighten]
     kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, *after, *([check] if check else [])]
-    return [kind(k) for k in range(config.rounds) for kind in kinds]
+    return [*steady, *(kind(k) for k in range(config.rounds) for kind in kinds)]
 
 
 def _pieces(continues: Tensor) -> Tensor:

@@ -332,12 +332,13 @@ class SSPLTrainer(Trainer):
         end_if_pending()
 
     def _save_trainer(self) -> None:
-        """Write a checkpoint; inside the phases without the pictures, which are not needed any more."""
+        """Write a checkpoint; inside the phases without the pictures, once these are not needed any more."""
         if self.checkpoint_rotation is None:
             return super()._save_trainer()
         checkpoint = self._sync_checkpoint_components()
         inside = self.phases is not None and self.phases.begun
-        names = [name for name in checkpoint.components if not (inside and name in _PICTURES)]
+        left_out = _PICTURES if inside and not self.phases.needs_pictures else ()  # type: ignore[union-attr]
+        names = [name for name in checkpoint.components if name not in left_out]
         step = self.collected_frames + self._optim_count
         step += self.phases.steps_done + self.phases.done if inside else 0  # type: ignore[union-attr]
         metadata = self._checkpoint_manifest_metadata()

@@ -1,0 +1,140 @@
+"""Results that take long, kept in files until what they belong to is done: an interruption costs seconds of them."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import pickle
+import shutil
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from torchrl_sspl.files import write
+from torchrl_sspl.interrupts import end_if_pending, pending
+
+FOLDER = "unfinished"
+_EVERY = 20.0  # seconds between two writings of what is not complete
+_SHORT = 1.0  # seconds up to which nothing is worth a file
+
+
+@dataclass
+class _Journal:
+    root: Path
+    folder: Path
+    entries: int = 0  # that were asked for: their order is the same when it is done again
+
+
+_journal: ContextVar[_Journal | None] = ContextVar("journal", default=None)
+
+
+@contextmanager
+def journal(directory: Path | None, name: str, *about: Any) -> Iterator[None]:
+    """Inside, an :class:`Entry` keeps what was computed; after an interruption the same computation takes it from there.
+
+    Args:
+        directory: of the run, of which the folder ``unfinished`` is used, and removed when the outermost journal ends in good order;
+            None: nothing is kept, unless in a journal around this one, whose directory counts.
+        name: of the part of the run.
+        about: what the results depend on (tensors, and what prints the same in every process); of anything else they are not taken.
+
+    Source: none.
+
+    Example:
+        >>> with journal(Path("runs/try"), "sums", 3):
+        ...     Entry("first").save(torch.ones(2), complete=True)
+        ...     Entry("second").saved()
+        >>> Path("runs/try/unfinished").exists()
+        False
+    """
+    around = _journal.get()
+    root = around.root if around is not None else None if directory is None else directory / FOLDER
+    if root is None:
+        yield
+        return
+    folder = root / f"{name}-{_digest(about)}"
+    for old in root.glob(f"{name}-*"):  # of other weights, or other settings
+        if old != folder:
+            shutil.rmtree(old, ignore_errors=True)
+    token = _journal.set(_Journal(root, folder))
+    try:
+        yield
+    finally:
+        _journal.reset(token)
+    if around is None:
+        shutil.rmtree(root, ignore_errors=True)
+
+
+class Entry:
+    """The next result of the open journal; without one it keeps nothing.
+
+    Args:
+        about: what tells this result from others, as in :func:`journal`.
+
+    Source: none.
+
+    Example:
+        >>> entry = Entry("sum", 3)
+        >>> entry.saved() is None
+        True
+    """
+
+    def __init__(self, *about: Any) -> None:
+        self._began = self._written = time.monotonic()
+        self._path: Path | None = None
+        opened = _journal.get()
+        if opened is not None:
+            opened.entries += 1
+            self._path = opened.folder / f"{opened.entries:05d}-{_digest(about)}.pt"
+
+    def saved(self) -> Any:
+        """What was saved last, complete or not; None where there is nothing that can be read."""
+        if self._path is None or not self._path.is_file():
+            return None
+        with suppress(OSError, RuntimeError, ValueError, EOFError, pickle.UnpicklingError):  # of a machine that went down
+            return torch.load(self._path, weights_only=True)
+        return None
+
+    @property
+    def due(self) -> bool:
+        """Whether it is time to save what is not complete, or somebody waits for that."""
+        return self._path is not None and (pending() or time.monotonic() - self._written >= _EVERY)
+
+    def save(self, value: Any, *, complete: bool = False) -> None:
+        """Keeps tensors, numbers, texts, and lists and dictionaries of these, unless they are complete and took no time."""
+        if self._path is None or (complete and time.monotonic() - self._began < _SHORT):
+            return
+        content = io.BytesIO()
+        torch.save(value, content)
+        write(self._path, content.getvalue())
+        self._written = time.monotonic()
+        end_if_pending()
+
+
+def _digest(about: Any) -> str:
+    """Digits that are the same for the same values."""
+    found = hashlib.sha256()
+
+    def add(value: Any) -> None:
+        if isinstance(value, Tensor):
+            plain = value.detach().cpu().contiguous()
+            found.update(f"{plain.dtype}{tuple(plain.shape)}".encode() + plain.reshape(-1).view(torch.uint8).numpy().tobytes())
+        elif isinstance(value, (list, tuple)):
+            found.update(f"[{len(value)}".encode())
+            for part in value:
+                add(part)
+        else:
+            found.update(f"{value!r};".encode())
+
+    add(about)
+    return found.hexdigest()[:16]
+
+
+__all__ = ["FOLDER", "Entry", "journal"]
