@@ -14,7 +14,7 @@ import torchrl_sspl
 PACKAGE = Path(torchrl_sspl.__file__).parent  # the checkout's, or that of an installed wheel
 ROOT = PACKAGE.parent
 FLOORS = {
-    "errors": 0, "devices": 0, "sets": 0, "functional": 0, "seeds": 0, "interrupts": 0, "files": 0, "direction": 0,
+    "errors": 0, "devices": 0, "sets": 0, "functional": 0, "seeds": 0, "interrupts": 0, "files": 0, "journal": 0, "direction": 0,
     "lipschitz": 1,
     "modules": 2, "envs": 2, "certification": 2,
     "viability": 2, "configs": 2, "objectives": 3, "data": 3,

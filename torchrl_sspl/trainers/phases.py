@@ -277,10 +277,6 @@ class Workspace:
         level, nets = self.level if level is None else level, self.networks.values()
         return Agent.from_networks(self.encoder, *nets, level=level, description=self.description, **self.acts())
 
-    def digest(self) -> str:
-        """Of the weights of all networks as they are."""
-        return weights_digest({f"{k}.{name}": v for k, net in (("nets", self.networks), ("encoder", self.encoder)) for name, v in net.state_dict().items()})
-
     def acts(self) -> dict[str, Any]:
         """How the agent acts on its latents: the observer's gain, and what the policy chooses from."""
         s, scale = self.config, self.action_scale
@@ -450,7 +446,8 @@ class Phases(TrainerHookBase):
             work.logged_step = base + self.steps_done
             self._show(phase, rounds)
             if not work.skip:
-                with journal(work.out_dir, f"{phase.name}-{phase.number}", work.digest()):
+                weights = [weights_digest(net.state_dict()) for net in (work.encoder, work.networks)]
+                with journal(work.out_dir, f"{phase.name}-{phase.number}", *weights):
                     phase.run(work)
             work.loop.restart()
             self.done += 1

@@ -56,7 +56,6 @@ _STARTS = 1024  # latents from which they are climbed to
 _BESIDE = 0.05  # barrier value up to which these may lie outside the set
 _INSIDE = 0.02  # ... up to which what lies outside counts as a counterexample, too
 _NEARLY = 0.01  # ... below zero from which on a successor is nearly one
-_RARE = 1.5  # times as far as changes of pictures were seen to move latents: rare ones move them farther
 _UNROLLED = 24  # steps through the observer
 _NEAR = 0.2  # barrier value up to which further rounds look at transitions of the policy
 
@@ -520,8 +519,8 @@ class Settle(Tighten):
 
 
 def _as_changed(work: Workspace, latent: Tensor) -> Tensor:
-    """Latents ``(n, p)`` moved by what changes of pictures were seen to do, and somewhat farther."""
-    return within(latent + _RARE * work.changes[work.loop.pick(len(work.changes), len(latent))], work.direction)
+    """Latents ``(n, p)`` moved by what changes of pictures were seen to do."""
+    return within(latent + work.changes[work.loop.pick(len(work.changes), len(latent))], work.direction)
 
 
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
