@@ -11,6 +11,7 @@ import torchrl_sspl.journal as module
 from torchrl_sspl.certification import closed_loop
 from torchrl_sspl.certification.branch_and_bound import Budget, maximise
 from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.evaluation.controllers import AgentController, RandomController
 from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.interrupts import Interrupted
@@ -150,6 +151,30 @@ def test_a_finished_proof_is_not_made_again_and_one_of_another_level_is(tmp_path
     assert other[1] > 0
 
 
+def test_the_time_of_a_search_counts_over_its_interruptions(tmp_path):
+    with journal_of_a_killed_run(tmp_path, "run"):
+        maximise(problem(), budget=Budget(boxes=3000))
+    (path,) = tmp_path.rglob("*.pt")
+    torch.save(_search(problem(), seconds=100.0), path)
+    with journal(tmp_path, "run"):
+        assert maximise(problem(), budget=Budget(boxes=3000)).seconds > 100.0
+
+
+def _search(of, seconds):
+    from torchrl_sspl.certification.branch_and_bound import _Search
+
+    return _Search(of, None, 1e-3, None, True).state_dict() | {"seconds": seconds}
+
+
+def test_what_draws_its_actions_is_not_kept(tmp_path):
+    """What it draws next depends on what it has drawn."""
+    env = PendulumEnv()
+    drawn = AgentController(load("pendulum"), driver=RandomController.within(env, 0))
+    with journal(tmp_path, "run"):
+        simulate(drawn, env, start=torch.zeros(2, 2), horizon=2)
+        assert not list(tmp_path.rglob("*.pt"))
+
+
 def test_a_signal_ends_a_proof_when_it_is_saved(tmp_path, monkeypatch):
     """A training that saves its state does not wait for the end of a proof that takes minutes."""
     monkeypatch.setattr(module, "_EVERY", 1e9)
@@ -161,7 +186,9 @@ def test_a_signal_ends_a_proof_when_it_is_saved(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "end_if_pending", end)
     with pytest.raises(Interrupted), journal(tmp_path, "run"):
         maximise(problem())
-    assert len(list(tmp_path.rglob("*.pt"))) == 1
+    (path,) = tmp_path.rglob("*.pt")
+    assert "boxes" in torch.load(path)
+    assert "status" not in torch.load(path)
 
 
 def test_episodes_and_latents_are_not_made_again(tmp_path, monkeypatch):
@@ -181,6 +208,7 @@ def test_episodes_and_latents_are_not_made_again(tmp_path, monkeypatch):
             killed_after(6, patch, PendulumEnv, "draw")
             found = encode_states(agent, env, states), simulate(agent, env, start=states, horizon=3)
     assert 3 <= count[0] / 6 <= attempts < count[0] / 2
+    assert expected[0].shape == (50, agent.latent_dim)
     assert torch.equal(expected[0], found[0])
     for name in ("states", "barrier", "latent", "actions", "alive"):
         assert torch.equal(getattr(expected[1], name), getattr(found[1], name)), name

@@ -100,13 +100,29 @@ def test_u_keeps_away_from_what_changes_do():
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    found = experiment(tmp_path_factory.mktemp("whole"), *STEADY)
-    return found, found.train()
+    found, asked, whole = experiment(tmp_path_factory.mktemp("whole"), *STEADY), [], synthesis._as_changed
+
+    def seen(work, latent):
+        asked.append((work.where["phase"], work.changes.shape, latent))
+        return whole(work, latent)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(synthesis, "_as_changed", seen)
+        agent = found.train()
+    return found, agent, asked
+
+
+def test_the_fine_tuning_asks_for_u_as_changed(uninterrupted):
+    found, _, asked = uninterrupted
+    assert {phase for phase, _, _ in asked} >= {"steer", "tune"}
+    assert {shape[0] for _, shape, _ in asked} == {len(found.store)}
+    known = found.work.latents["latent"][found.work.unsafe()]
+    assert all(float((known - z).norm(dim=1).min()) < 1e-6 for z in asked[-1][2])
 
 
 @pytest.mark.parametrize(("checkpoints", "phase"), [(11, "steady"), (15, "gather")])
 def test_it_resumes_bit_for_bit_with_the_pictures_that_are_needed(tmp_path, uninterrupted, checkpoints, phase):
-    whole, expected = uninterrupted
+    whole, expected, _ = uninterrupted
     assert whole.store.augmentation is None
     killed = experiment(tmp_path, *STEADY, EVERY_STEP)
     killed_after(killed, checkpoints)
