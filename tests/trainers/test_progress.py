@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+from torch import nn
 
 from torchrl_sspl.trainers import progress as module
 from torchrl_sspl.trainers.phases import Check, Phase, Phases
@@ -92,7 +93,7 @@ def test_every_round_ends_with_a_sentence(capsys):
     loop = SimpleNamespace(step=0, restart=lambda: None, loss=None)
     work = SimpleNamespace(
         checks=[], config=SimpleNamespace(check_episodes=4000), loop=loop, skip=False, begin=lambda: None, finish=lambda: None,
-        out_dir=None, known={},
+        out_dir=None, encoder=nn.Identity(), networks=nn.ModuleDict(),
     )
     Phases([Checked(0)], work, progress=True).run()
     said = "".join(capsys.readouterr())
@@ -105,7 +106,7 @@ def test_every_round_ends_with_a_sentence(capsys):
 def test_every_phase_has_words():
     from torchrl_sspl.configs.schema import SynthesisConfig
 
-    for settings in (SynthesisConfig(), SynthesisConfig(teacher="clearance", tolerated_error=0.1)):
+    for settings in (SynthesisConfig(), SynthesisConfig(teacher="clearance", tolerated_error=0.1, steady_steps=1)):
         assert {phase.name for phase in synthesis_phases(settings)} <= set(WORDS)
 
 
