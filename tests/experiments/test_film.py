@@ -7,6 +7,7 @@ import torch
 
 import torchrl_sspl as sspl
 from torchrl_sspl.envs import DubinsEnv, Opening, PendulumEnv
+from torchrl_sspl.evaluation.known import barrier_of
 from torchrl_sspl.experiments.film import Film
 
 
@@ -48,6 +49,15 @@ def test_what_acts_without_a_barrier_has_no_filter_and_no_verdict():
     assert alone.values is policy.values is None
     assert policy.said == [("", "fair")] * 5
     assert len(film.scene(film.env.system.openings[1], seed=0).takes) == 1
+
+
+@pytest.mark.parametrize(("name", "env"), [("pendulum", PendulumEnv), ("quadruped", DubinsEnv)])
+def test_who_starts_at_the_border_of_the_set_starts_inside(name, env):
+    system = env(seed=0)
+    (start,) = (opening.start for opening in system.system.openings if "border of the safe set" in opening.title)
+    state = torch.tensor([start])
+    assert -0.15 < float(barrier_of(sspl.load(name), system, state)) < 0.0
+    assert not bool(system.unsafe_set.contains(state))
 
 
 @pytest.mark.pybullet

@@ -242,13 +242,13 @@ class DubinsEnv(SafetyEnv):
         )
 
     def _openings(self) -> tuple[Opening, ...]:
-        """From the left: into the middle of the obstacle, past it, from close by, and there and back."""
+        """From the left: into the middle of the obstacle, past it, from just inside the set, and there and back."""
         (x, y), unsafe = self.obstacle_centre, self.unsafe_half_size
         start, far = x - 0.9 * self.arena_half_size, 0.7 * self.arena_half_size
         return (
             Opening("Head on", (start, y, 0.0)),
             Opening("Grazing the unsafe set", (start, y + 0.85 * unsafe, 0.0)),
-            Opening("From the border of the safe set", (x - 0.6 * self.arena_half_size, y - 0.85 * unsafe, 0.0)),
+            Opening("From the border of the safe set", (x - 0.69 * self.arena_half_size, y - 0.93 * unsafe, 0.0)),
             Opening(
                 "A goal behind the obstacle, and back", (start, y, 0.0),
                 lambda: ThereAndBack(((x + far, y), (x - far, y)), self.max_yaw_rate),
