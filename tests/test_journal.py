@@ -213,3 +213,29 @@ def test_episodes_and_latents_are_not_made_again(tmp_path, monkeypatch):
     for name in ("states", "barrier", "latent", "actions", "alive"):
         assert torch.equal(getattr(expected[1], name), getattr(found[1], name)), name
     assert expected[1].events.keys() == found[1].events.keys()
+
+
+def test_blocks_of_a_certificate_are_not_drawn_again(tmp_path, monkeypatch):
+    from torchrl_sspl.evaluation import certify as module_of_certify
+    from torchrl_sspl.evaluation.blocks import StateBlocks
+
+    agent, env = load("pendulum"), PendulumEnv()
+
+    def layers(name):
+        with journal(tmp_path / name, "run"):
+            found = module_of_certify.certify(agent, env, level=0.0, episodes=600, horizon=2, budget=Budget(boxes=1))
+        return {k: [(s.name, s.value, s.n) for s in layer.statements] for k, layer in found.layers.items()}, found.record
+
+    with monkeypatch.context() as patch:
+        drawn = killed_after(10**9, patch, StateBlocks, "__call__")
+        expected, record = layers("whole")
+    assert len(record.blocks) == drawn[0] > 1
+    with monkeypatch.context() as patch, suppress(Killed):
+        killed_after(drawn[0] - 1, patch, StateBlocks, "__call__")
+        layers("killed")
+    with monkeypatch.context() as patch:
+        again = killed_after(10**9, patch, StateBlocks, "__call__")
+        found, same = layers("killed")
+    assert again[0] == 1
+    assert found == expected
+    assert same.blocks == record.blocks

@@ -37,7 +37,7 @@ from torchrl_sspl.certification.conditions import tolerates
 from torchrl_sspl.certification.floating import UNITS
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
 from torchrl_sspl.certification.loop import closed_loop
-from torchrl_sspl.certification.record import Record
+from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.rounding import missed, shown
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
@@ -55,6 +55,7 @@ from torchrl_sspl.evaluation.blocks import (
     summarise,
     summary_changes,
 )
+from torchrl_sspl.journal import Entry, journal
 from torchrl_sspl.modules.agent import Agent, agent_directory
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 
@@ -317,7 +318,8 @@ def _measured(certificate: Certificate, agent: Agent, source: Any, progress: boo
     record, blocks = source.record, list[Block]()
     with tqdm(desc="certificate", unit="block", disable=not progress, leave=False) as bar:
         while not record.complete():
-            blocks.append(source(len(blocks)))
+            with journal(None, f"block{len(blocks)}", certificate.weights, certificate.level, record.kind, record.seed, record.size(len(blocks))):
+                blocks.append(_kept_block(source, len(blocks)))
             record.blocks.append(blocks[-1].counts)
             bar.update()
     summarise(record, blocks, agent)
@@ -325,6 +327,17 @@ def _measured(certificate: Certificate, agent: Agent, source: Any, progress: boo
     certificate.record = record
     certificate.layers |= _measured_layers(record, certificate, agent)
     return certificate
+
+
+def _kept_block(source: Any, index: int) -> Block:
+    """A block of episodes, from the open journal where it has it: each is drawn with a seed of its own."""
+    entry = Entry("block", index)
+    kept = entry.saved()
+    if kept is not None:
+        return Block(**kept | {name: Counts(**kept[name]) for name in ("counts", "least")})
+    block: Block = source(index)
+    entry.save(vars(block) | {name: vars(getattr(block, name)) for name in ("counts", "least")}, complete=True)
+    return block
 
 
 def _tolerated(certificate: Certificate, agent: Agent) -> float | None:
