@@ -84,7 +84,7 @@ class Training:
 
     def _watch(self, folder: Path) -> None:
         while self.process.poll() is None:
-            kept = [*folder.glob("checkpoints/*"), *folder.glob("unfinished/*/*.pt")]
+            kept = [*folder.glob("checkpoints/*"), *folder.glob("unfinished/**/*.pt")]
             found = [at for at in (_written(path) for path in kept) if at > self.saved[-1]]
             self.saved += sorted(found)[-1:]
             time.sleep(0.1)

@@ -92,8 +92,21 @@ def test_it_is_gone_when_the_outermost_ends_and_not_before(tmp_path):
     with journal(tmp_path, "run"):
         with journal(None, "part"):  # a part of it
             Entry("a").save(1, complete=True)
-        assert len(list(tmp_path.glob(f"{FOLDER}/part-*/*.pt"))) == 1
+        assert len(list(tmp_path.glob(f"{FOLDER}/run-*/part-*/*.pt"))) == 1
     assert not (tmp_path / FOLDER).exists()
+
+
+def test_what_the_journal_around_depends_on_counts_inside(tmp_path):
+    """A certificate of episodes of 200 steps takes no block that an earlier configuration has left behind."""
+
+    def run(about):
+        with journal_of_a_killed_run(tmp_path, "evaluation", about), journal(None, "part"):
+            entry = Entry("a")
+            found = entry.saved()
+            entry.save(about, complete=True)
+        return found
+
+    assert [run(50), run(50), run(200), run(50)] == [None, 50, None, None]
 
 
 def test_what_took_no_time_has_no_file(tmp_path, monkeypatch):
@@ -221,9 +234,9 @@ def test_blocks_of_a_certificate_are_not_drawn_again(tmp_path, monkeypatch):
 
     agent, env = load("pendulum"), PendulumEnv()
 
-    def layers(name):
+    def layers(name, horizon=2):
         with journal(tmp_path / name, "run"):
-            found = module_of_certify.certify(agent, env, level=0.0, episodes=600, horizon=2, budget=Budget(boxes=1))
+            found = module_of_certify.certify(agent, env, level=0.0, episodes=600, horizon=horizon, budget=Budget(boxes=1))
         return {k: [(s.name, s.value, s.n) for s in layer.statements] for k, layer in found.layers.items()}, found.record
 
     with monkeypatch.context() as patch:
@@ -237,5 +250,12 @@ def test_blocks_of_a_certificate_are_not_drawn_again(tmp_path, monkeypatch):
         again = killed_after(10**9, patch, StateBlocks, "__call__")
         found, same = layers("killed")
     assert again[0] == 1
+    with monkeypatch.context() as patch, suppress(Killed):
+        killed_after(drawn[0] - 1, patch, StateBlocks, "__call__")
+        layers("other")
+    with monkeypatch.context() as patch:
+        other = killed_after(10**9, patch, StateBlocks, "__call__")
+        layers("other", horizon=1)
+    assert other[0] == drawn[0], "of longer episodes"
     assert found == expected
     assert same.blocks == record.blocks

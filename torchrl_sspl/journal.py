@@ -27,7 +27,6 @@ _SHORT = 1.0  # seconds up to which nothing is worth a file
 
 @dataclass
 class _Journal:
-    root: Path
     folder: Path
     entries: int = 0  # that were asked for: their order is the same when it is done again
 
@@ -43,7 +42,8 @@ def journal(directory: Path | None, name: str, *about: Any) -> Iterator[None]:
         directory: of the run, of which the folder ``unfinished`` is used, and removed when the outermost journal ends in good order;
             None: nothing is kept, unless in a journal around this one, whose directory counts.
         name: of the part of the run.
-        about: what the results depend on (tensors, and what prints the same in every process); of anything else they are not taken.
+        about: what the results depend on (tensors, and what prints the same in every process), beside what the journal around depends
+            on; of anything else they are not taken.
 
     Source: none.
 
@@ -55,7 +55,8 @@ def journal(directory: Path | None, name: str, *about: Any) -> Iterator[None]:
         False
     """
     around = _journal.get()
-    root = around.root if around is not None else None if directory is None else directory / FOLDER
+    # Inside of the folder around it: what that depends on counts here, too.
+    root = around.folder if around is not None else None if directory is None else directory / FOLDER
     if root is None:
         yield
         return
@@ -63,7 +64,7 @@ def journal(directory: Path | None, name: str, *about: Any) -> Iterator[None]:
     for old in root.glob(f"{name}-*"):  # of other weights, or other settings
         if old != folder:
             shutil.rmtree(old, ignore_errors=True)
-    token = _journal.set(_Journal(root, folder))
+    token = _journal.set(_Journal(folder))
     try:
         yield
     finally:

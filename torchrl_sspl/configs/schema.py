@@ -186,7 +186,8 @@ class SynthesisConfig:
     exploration: float = _option(0.15, "standard deviation of the exploration in further rounds, as a share of the "
         "largest action.")
     steady_steps: int = _option(0, "steps of the encoder alone, before all others, after which pictures changed as in augmentation show "
-        "what unchanged ones do; the data stay unchanged then. 0: augmentation changes the data.")
+        "what unchanged ones do; the data stay unchanged then, and the fine-tuning keeps U away from the set by what the changes still do (which targets on a grid leave out). "
+        "0: augmentation changes the data.")
     dynamics_steps: int = _option(1500, "optimiser steps of the refit of the latent dynamics.")
     unsafe_weight: float = _option(1.0, "weight of transitions that start in U in the refit of the dynamics; below 1 "
         "where the pictures there are not worth the networks' capacity (a robot in front of the obstacle that it stands on).")

@@ -316,10 +316,10 @@ def _measured(certificate: Certificate, agent: Agent, source: Any, progress: boo
     """The certificate with the layers that follow from blocks, drawn until there are enough."""
     source.tolerated = _tolerated(certificate, agent)
     record, blocks = source.record, list[Block]()
+    about = certificate.weights, certificate.level, source.tolerated, repr(record)  # which has no blocks yet
     with tqdm(desc="certificate", unit="block", disable=not progress, leave=False) as bar:
         while not record.complete():
-            with journal(None, f"block{len(blocks)}", certificate.weights, certificate.level, record.kind, record.seed, record.size(len(blocks))):
-                blocks.append(_kept_block(source, len(blocks)))
+            blocks.append(_kept_block(source, len(blocks), about))
             record.blocks.append(blocks[-1].counts)
             bar.update()
     summarise(record, blocks, agent)
@@ -329,15 +329,16 @@ def _measured(certificate: Certificate, agent: Agent, source: Any, progress: boo
     return certificate
 
 
-def _kept_block(source: Any, index: int) -> Block:
+def _kept_block(source: Any, index: int, about: Any) -> Block:
     """A block of episodes, from the open journal where it has it: each is drawn with a seed of its own."""
-    entry = Entry("block", index)
-    kept = entry.saved()
-    if kept is not None:
-        return Block(**kept | {name: Counts(**kept[name]) for name in ("counts", "least")})
-    block: Block = source(index)
-    entry.save(vars(block) | {name: vars(getattr(block, name)) for name in ("counts", "least")}, complete=True)
-    return block
+    with journal(None, f"block{index}", about):
+        entry = Entry()
+        kept = entry.saved()
+        if kept is not None:
+            return Block(**kept | {name: Counts(**kept[name]) for name in ("counts", "least")})
+        block: Block = source(index)
+        entry.save(vars(block) | {name: vars(getattr(block, name)) for name in ("counts", "least")}, complete=True)
+        return block
 
 
 def _tolerated(certificate: Certificate, agent: Agent) -> float | None:

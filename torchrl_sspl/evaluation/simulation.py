@@ -216,8 +216,8 @@ def _asked(acts: Controller, last: bool) -> Callable[..., Decision]:
 def _from_states(
     acts: Controller, env: Any, start: Tensor, horizon: int, draw: Draw, film: int, label: str | None, watch: Watch | None
 ) -> Episodes:
-    size = len(start) if getattr(acts, "streams", False) else CHUNK  # whose pictures are held
-    size = _PART if _alone(acts, watch) else size
+    # Others that stream hold few pictures at a time by themselves.
+    size = _PART if _alone(acts, watch) else len(start) if getattr(acts, "streams", False) else CHUNK
     if len(start) <= size:
         run = partial(_side_by_side, acts, env, start, horizon, draw, film, label, watch)
         return _kept(acts, watch, run, start, horizon, film)

@@ -22,7 +22,8 @@ class SteadyEncoder(Phase):
 
     with :math:`\bar E` the encoder of the joint training, and :math:`\tilde o` the picture o as a camera of :class:`Augmentation`
     captures it, drawn anew in every step. The data stay unchanged, so dynamics and barrier are fitted to clean latents; what changes
-    still do to latents is kept, and U is pushed out of the set by as much. Raises ConfigError without stored pictures, without changes,
+    still do to latents is kept, and :class:`FineTune` pushes U out of the set by as much (:class:`Settle`, after targets on a grid, does not).
+    Raises ConfigError without stored pictures, without changes,
     or if the encoder has nothing to train. Source: none (self-distillation).
     """
 
@@ -59,8 +60,9 @@ class SteadyEncoder(Phase):
 
         work.loop(self.size(work), {encoder: _LR}, step)
         kept = torch.randint(n, (min(n, _KEPT),), generator=work.loop.generator)
-        work.changes = self._encoded(work, kept, spawn(work.seed, "pictures", 1)) - self._encoded(work, kept)
-        spread, moved = work.changes.std(0), (self._encoded(work, torch.arange(n)) - before).std(0)
+        after = self._encoded(work, torch.arange(n))
+        work.changes = self._encoded(work, kept, spawn(work.seed, "pictures", 1)) - after[kept]
+        spread, moved = work.changes.std(0), (after - before).std(0)
         work.log({"step": self.size(work), "left_by_changes": spread.tolist(), "moved": moved.tolist()})
 
     @staticmethod
