@@ -60,12 +60,23 @@ def test_who_starts_at_the_border_of_the_set_starts_inside(name, env):
     assert not bool(system.unsafe_set.contains(state))
 
 
+@pytest.mark.parametrize("k", range(4))
+def test_every_walk_of_the_film_enters_u_without_protection_and_goes_on_for_eight_seconds_behind_the_filter(k):
+    env = DubinsEnv(seed=0)
+    film = Film(sspl.load("quadruped"), env, seconds=8.0)
+    alone, protected = film.scene(env.system.openings[k], seed=0).takes
+    assert "bad" in kinds(alone)
+    assert protected.name == "behind the safety filter"
+    assert set(protected.said) == {("inside: the proof applies", "good")}
+    assert len(protected.said) == round(8.0 / env.dt) + 1
+
+
 @pytest.mark.pybullet
 def test_the_robot_hits_without_protection_and_passes_with_it_in_25_pictures_a_second():
     pytest.importorskip("pybullet")
     env = DubinsEnv(seed=0)
     film = Film(sspl.load("quadruped"), env, world=env.physics()(), seconds=3.0)
-    alone, learned = film.scene(env.system.openings[0], seed=0).takes
+    alone, learned = film.scene(Opening("Head on", (-1.8, 0.0, 0.0)), seed=0).takes
     first, second = (picture for picture, _ in zip(learned.pictures, range(2), strict=False))
     film.close()
     assert film.rate == 25

@@ -242,17 +242,27 @@ class DubinsEnv(SafetyEnv):
         )
 
     def _openings(self) -> tuple[Opening, ...]:
-        """From the left: into the middle of the obstacle, past it, from just inside the set, and there and back."""
-        (x, y), unsafe = self.obstacle_centre, self.unsafe_half_size
-        start, far = x - 0.9 * self.arena_half_size, 0.7 * self.arena_half_size
+        """Corner to corner, past the obstacle, from just inside the set, and there and back: each heads for goals that it hides."""
+        (x, y), unsafe, half = self.obstacle_centre, self.unsafe_half_size, self.arena_half_size
+        start, far, corner = x - 0.9 * half, 0.7 * half, 0.65 * half
+
+        def between(*goals: tuple[float, float]) -> Callable[[], ThereAndBack]:
+            return lambda: ThereAndBack([(x + a, y + b) for a, b in goals], self.max_yaw_rate)
+
         return (
-            Opening("Head on", (start, y, 0.0)),
-            Opening("Grazing the unsafe set", (start, y + 0.85 * unsafe, 0.0)),
-            Opening("From the border of the safe set", (x - 0.69 * self.arena_half_size, y - 0.93 * unsafe, 0.0)),
             Opening(
-                "A goal behind the obstacle, and back", (start, y, 0.0),
-                lambda: ThereAndBack(((x + far, y), (x - far, y)), self.max_yaw_rate),
+                "Head on, from corner to corner", (x - 0.8 * half, y - 0.8 * half, math.pi / 4),
+                between((corner, corner), (-corner, -corner)),
             ),
+            Opening(
+                "Grazing the unsafe set", (start, y + 0.85 * unsafe, 0.0),
+                between((far, 0.85 * unsafe), (-far, 0.85 * unsafe)),
+            ),
+            Opening(
+                "From the border of the safe set", (x - 0.69 * half, y - 0.93 * unsafe, 0.0),
+                between((far, -0.93 * unsafe), (-far, -0.93 * unsafe)),
+            ),
+            Opening("A goal behind the obstacle, and back", (start, y, 0.0), between((far, 0.0), (-far, 0.0))),
         )  # fmt: skip
 
     def known_twin(self) -> DubinsEnv:

@@ -63,6 +63,11 @@ class Film:
         """Where the pictures of all takes are drawn; to paint its ground takes most of a second."""
         return self.world.stage(VIEW, _COLOURS)
 
+    @functools.cached_property
+    def _shield(self) -> Shield:
+        """What protects all takes; its margin takes a second to prove."""
+        return Shield(self.agent, margin=None if self.agent.tolerated_error > 0.0 else UNPROVED_MARGIN)
+
     def close(self) -> None:
         """End the full physics."""
         for ended in (self.__dict__.pop("_stage", None), self.world):
@@ -87,8 +92,7 @@ class Film:
         if opening.nominal is None:
             takes.append(self._take("the learned policy", opening.start, seed))
         elif isinstance(self.agent, Agent):
-            shield = Shield(self.agent, margin=None if self.agent.tolerated_error > 0.0 else UNPROVED_MARGIN)
-            takes.append(self._take("behind the safety filter", opening.start, seed, driver=nominal(), shield=shield))
+            takes.append(self._take("behind the safety filter", opening.start, seed, driver=nominal(), shield=self._shield))
         return Scene(opening.title, takes)
 
     def levels(self, arrays: dict[str, Any]) -> tuple[Tensor, dict[str, Tensor]] | None:
