@@ -11,7 +11,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_sspl.data import collect_random
-from torchrl_sspl.envs.gymnasium import GymnasiumPixels
+from torchrl_sspl.envs.gymnasium import GymnasiumPixels, _area_averaged
 from torchrl_sspl.errors import ConfigError, OverlapError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
@@ -214,3 +214,15 @@ def test_an_observation_that_is_a_picture_is_what_the_networks_see():
     data = env.rollout(3, policy=lambda td: td.set("action", torch.full((1, 1), 1.0)))
     assert position(data["pixels"][0, :, :3]).tolist() == [6, 6, 7]
     assert position(data["next", "pixels"][0, :, 3:]).tolist() == [7, 8, 9]
+
+
+@pytest.mark.parametrize("shape", [(400, 600), (65, 70), (500, 500), (30, 40), (64, 300), (720, 1280)])
+@pytest.mark.parametrize("size", [32, 64, 96])
+def test_pictures_are_averaged_as_torch_does_it_bit_for_bit(shape, size):
+    rng = np.random.default_rng(0)
+    for picture in (rng.integers(0, 256, (*shape, 3), dtype=np.uint8), np.full((*shape, 3), 255, np.uint8)):
+        channels = torch.from_numpy(picture).permute(2, 0, 1)[None].float()
+        area = torch.nn.functional.interpolate(channels, size=(size, size), mode="area")[0].add(0.5).to(torch.uint8)
+        by_columns = np.ascontiguousarray(picture.transpose(1, 0, 2)).transpose(1, 0, 2)
+        for same in (picture, by_columns):
+            assert torch.equal(torch.from_numpy(_area_averaged(same, size)).permute(2, 0, 1), area)
