@@ -13,7 +13,14 @@ from torch.nn import functional as F
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError
-from torchrl_sspl.modules import BearingEncoder, LatentDynamics, MomentEncoder, Policy, ShapeEncoder
+from torchrl_sspl.modules import (
+    BearingEncoder,
+    LatentDynamics,
+    MomentEncoder,
+    Policy,
+    ShapeBearingEncoder,
+    ShapeEncoder,
+)
 from torchrl_sspl.modules.agent import Agent, mlp_barrier
 from torchrl_sspl.modules.moments import Bearing
 
@@ -136,6 +143,46 @@ def test_an_encoder_of_shapes_needs_four_latents_and_survives_disk(arrows, tmp_p
     twin = ShapeEncoder(**encoder.arguments)
     twin.load_state_dict(encoder.state_dict())
     assert torch.equal(twin(pixels[:9]), encoder(pixels[:9]))
+
+
+@pytest.fixture(scope="module")
+def disc_ahead():
+    """Encoder of bearings fitted to arrows of one colour, fresh states, and where the disc lies for each: ahead, aside [m]."""
+    env, generator = CMUDubinsEnv(), torch.Generator().manual_seed(0)
+    encoder = ShapeBearingEncoder(3, 128)
+    encoder.fit(env.draw(env.sample_states(500, generator)))
+    states = env.sample_states(300, generator) * torch.tensor([0.8, 0.8, 1.0])
+    (x, y), c, s = -states[:, :2].T, states[:, 2].cos(), states[:, 2].sin()
+    return env, encoder, states, torch.stack([c * x + s * y, s * x - c * y], -1)  # aside is to the right in a picture
+
+
+def test_a_disc_lies_where_it_does_seen_from_an_arrow_of_one_colour(disc_ahead):
+    env, encoder, states, truth = disc_ahead
+    seen = 1.1 * torch.atanh(encoder(env.observe(states))[:, :2])  # m
+    off = seen - truth + torch.tensor([0.05, 0.0])  # the middle of the arrow is ahead of the car
+    assert off.norm(dim=-1).mean() < 0.01
+    assert off.norm(dim=-1).max() < 0.06
+
+
+def test_an_arrow_that_turns_with_its_place_around_the_disc_sees_the_same(disc_ahead):
+    env, encoder, states, _ = disc_ahead
+    quarter = torch.stack([-states[:, 1], states[:, 0], states[:, 2] + math.pi / 2], -1)
+    moved = encoder(env.observe(quarter)) - encoder(env.observe(states))
+    assert moved.abs().mean() < 0.005
+
+
+def test_an_encoder_of_the_disc_leaves_entries_to_the_memory_and_survives_disk(disc_ahead):
+    env, encoder, states, _ = disc_ahead
+    latent = encoder(env.observe(states[:9]))
+    assert torch.equal(latent[:, 2:], torch.zeros(9, 1))
+    assert not any(p.requires_grad for p in encoder.parameters() if p is encoder.gain)
+    twin = ShapeBearingEncoder(**encoder.arguments)
+    twin.load_state_dict(encoder.state_dict())
+    assert torch.equal(twin(env.observe(states[:9])), latent)
+    assert encoder(torch.full((1, 6, 128, 128), 255, dtype=torch.uint8)).isfinite().all()
+    for wrong in ({"latent_dim": 1}, {"latent_dim": 2, "reach": 0.0}):
+        with pytest.raises(ConfigError, match="latent_dim >= 2 and reach > 0"):
+            ShapeBearingEncoder(**wrong)
 
 
 @pytest.fixture(scope="module")

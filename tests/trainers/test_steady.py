@@ -8,6 +8,7 @@ import pytest
 import torch
 from test_phases import EVERY_STEP, assert_same, experiment, killed_after
 
+from torchrl_sspl import journal
 from torchrl_sspl.configs import compose
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.data import Augmentation, TransitionStore, collect_random
@@ -15,7 +16,16 @@ from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.lipschitz import SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.trainers import Phases, Source, SteadyEncoder, Workspace, synthesis, synthesis_phases
+from torchrl_sspl.trainers import (
+    KeepChanges,
+    Phases,
+    Source,
+    SteadyEncoder,
+    Workspace,
+    steady,
+    synthesis,
+    synthesis_phases,
+)
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:init_random_frames")
 STEADY = ["augmentation.share=1.0", "synthesis.steady_steps=4"]
@@ -46,10 +56,10 @@ def test_changes_move_latents_less_afterwards_and_unchanged_pictures_are_seen_as
     changes = Augmentation(share=1.0, noise=60.0, brightness=0.0, shift=0.0)
     work = workspace(changes=changes, steady_steps=150)
     before = copy.deepcopy(work.encoder)
-    Phases([SteadyEncoder(0)], work).run()
+    Phases([SteadyEncoder(0), KeepChanges(0)], work).run()
     fresh = collect_random(make(seed=9), 200, seed=9, steps=4)
     frames = fresh.get(torch.arange(200))["frames"][:, :2]
-    changed = SteadyEncoder._changed(work, frames, 77).flatten(1, 2)
+    changed = steady._changed(work, frames, 77).flatten(1, 2)
     frames = frames.flatten(1, 2)
     left, usual = moved(work.encoder, before, frames, changed), moved(before, before, frames, changed)
     assert left < 0.6 * usual
@@ -60,7 +70,7 @@ def test_changes_move_latents_less_afterwards_and_unchanged_pictures_are_seen_as
 
 def test_both_frames_of_a_picture_are_of_one_camera():
     frames = torch.full((6, 2, 3, 8, 8), 100, dtype=torch.uint8)
-    changed = SteadyEncoder._changed(workspace(changes=Augmentation(share=1.0, noise=0.0)), frames, 3)
+    changed = steady._changed(workspace(changes=Augmentation(share=1.0, noise=0.0)), frames, 3)
     assert torch.equal(changed[:, 0], changed[:, 1])
     assert len({int(v) for v in changed[:, 0, 0, 0, 0]}) > 1
 
@@ -85,7 +95,7 @@ def test_a_configuration_without_changes_is_refused():
 
 def test_it_comes_first_and_once():
     names = [phase.name for phase in synthesis_phases(SynthesisConfig(rounds=2, steady_steps=3))]
-    assert names[:2] == ["steady", "gather"]
+    assert names[:3] == ["steady", "changes", "gather"]
     assert names.count("steady") == 1
 
 
@@ -96,6 +106,27 @@ def test_u_keeps_away_from_what_changes_do():
     by = synthesis._as_changed(work, latent)
     assert {tuple(round(v, 3) for v in row) for row in (by[::2] - latent[::2]).tolist()} == {(0.1, 0.0), (0.0, -0.2)}
     assert float(by.max()) == 1.0
+
+
+def test_pictures_that_were_encoded_are_taken_from_the_journal(tmp_path, monkeypatch):
+    work = workspace(changes=Augmentation(share=1.0))
+    rows, encode, asked = torch.arange(400), work.encoder.forward, []
+
+    def some(pixels):
+        asked.append(len(pixels))
+        if len(asked) == 3:
+            raise KeyboardInterrupt
+        return encode(pixels)
+
+    monkeypatch.setattr(steady, "_ENCODED", 100)
+    monkeypatch.setattr(journal, "_EVERY", 0.0)
+    expected = steady._encoded(work, rows, 5)
+    monkeypatch.setattr(work.encoder, "forward", some)
+    with pytest.raises(KeyboardInterrupt), journal.journal(tmp_path, "changes"):
+        steady._encoded(work, rows, 5)
+    with journal.journal(tmp_path, "changes"):
+        assert torch.equal(steady._encoded(work, rows, 5), expected)
+    assert asked == [100] * 5  # the third one twice
 
 
 @pytest.fixture(scope="module")
@@ -120,7 +151,7 @@ def test_the_fine_tuning_asks_for_u_as_changed(uninterrupted):
     assert all(float((known - z).norm(dim=1).min()) < 1e-6 for z in asked[-1][2])
 
 
-@pytest.mark.parametrize(("checkpoints", "phase"), [(11, "steady"), pytest.param(15, "gather", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("checkpoints", "phase"), [(11, "steady"), pytest.param(15, "changes", marks=pytest.mark.slow), pytest.param(16, "gather", marks=pytest.mark.slow)])
 def test_it_resumes_bit_for_bit_with_the_pictures_that_are_needed(tmp_path, uninterrupted, checkpoints, phase):
     whole, expected, _ = uninterrupted
     assert whole.store.augmentation is None

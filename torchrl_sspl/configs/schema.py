@@ -45,7 +45,7 @@ class NetworkConfig:
     policy_hidden: list[int] = _option([32, 32], "widths of the policy's hidden layers.")
     encoder: str = _option("FrameEncoder", 'name of an encoder of the library ("FrameEncoder": convolutions, '
         '"ContrastEncoder": convolutions on what differs from the background, "MomentEncoder": centres of colours before a background, "ShapeEncoder": place and direction of one thing of one '
-        'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves, "TurnedBearingEncoder": and its orientation), or "package.module:Class" of your own, called with '
+        'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves, "TurnedBearingEncoder": and its orientation, "ShapeBearingEncoder": the same as BearingEncoder for what moves in one colour), or "package.module:Class" of your own, called with '
         'those of latent_dim, image_size, pool_to and velocity_gain that it takes.')
     pool_to: int = _option(32, "frames are averaged to this height and width before the first layer, in pixels.")
     velocity_gain: float = _option(4.0, "factor on the difference of the two frames' features.")

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.modules.contrast import ContrastEncoder
-from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder, TurnedBearingEncoder
+from torchrl_sspl.modules.moments import (
+    BearingEncoder,
+    MomentEncoder,
+    ShapeBearingEncoder,
+    ShapeEncoder,
+    TurnedBearingEncoder,
+)
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
 from torchrl_sspl.modules.observer import LatentObserver, Predict
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
@@ -21,6 +27,7 @@ __all__ = [
     "Policy",
     "Predict",
     "SaLaD",
+    "ShapeBearingEncoder",
     "ShapeEncoder",
     "TurnedBearingEncoder",
     "as_tensordict_module",

@@ -26,7 +26,13 @@ from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.modules.contrast import ContrastEncoder
 from torchrl_sspl.modules.controller import Controller
 from torchrl_sspl.modules.export import export
-from torchrl_sspl.modules.moments import BearingEncoder, MomentEncoder, ShapeEncoder, TurnedBearingEncoder
+from torchrl_sspl.modules.moments import (
+    BearingEncoder,
+    MomentEncoder,
+    ShapeBearingEncoder,
+    ShapeEncoder,
+    TurnedBearingEncoder,
+)
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
 from torchrl_sspl.modules.observer import gain_matrix
 
@@ -49,7 +55,8 @@ def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
 ENCODERS: dict[str, type[nn.Module]] = {
     "FrameEncoder": FrameEncoder, "ContrastEncoder": ContrastEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder,
-    "BearingEncoder": BearingEncoder, "TurnedBearingEncoder": TurnedBearingEncoder,
+    "ShapeBearingEncoder": ShapeBearingEncoder, "BearingEncoder": BearingEncoder,
+    "TurnedBearingEncoder": TurnedBearingEncoder,
 }  # fmt: skip
 DYNAMICS: dict[str, type[nn.Module]] = {"LatentDynamics": LatentDynamics}
 POLICIES: dict[str, type[nn.Module]] = {"ChoosingPolicy": ChoosingPolicy, "Policy": Policy}

@@ -265,14 +265,93 @@ class ShapeEncoder(MomentEncoder):
         self.trunk = nn.Sequential(ShapeMoments(pool_to, self.in_channels))
         self.latent_head = mlp((4, hidden, latent_dim), nn.SiLU)
 
-    def head(self, previous: Tensor, current: Tensor) -> Tensor:
-        """Latent from the moments of two successive frames; see :meth:`FrameEncoder.head`."""
+    def ahead(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Direction ``(*batch, 2)`` of the thing, of length one where it is known, from the moments of two successive frames."""
         whole = (torch.minimum(previous, current)[..., 4:] / WHOLE).clamp(0.0, 1.0) ** 4
         shape, motion = (previous + current)[..., 2:4] / 2, (current - previous)[..., :2]
         ahead = whole * shape + (1 - whole) * self.velocity_gain * motion
-        ahead = ahead / (ahead.square().sum(-1, keepdim=True) + _VAGUE**2).sqrt()
-        seen = torch.cat([current[..., :2], ahead], -1)
+        return ahead / (ahead.square().sum(-1, keepdim=True) + _VAGUE**2).sqrt()
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the moments of two successive frames; see :meth:`FrameEncoder.head`."""
+        seen = torch.cat([current[..., :2], self.ahead(previous, current)], -1)
         return torch.tanh(self.gain * F.pad(seen, (0, self.latent_dim - 4)) + self.latent_head(seen))
+
+
+def _still(background: Tensor) -> Tensor:
+    """How much of a background ``(c, H, W)`` is not plain ground, ``(H, W)``: its largest difference over the colours, where that is seen."""
+    off = (background - background.flatten(1).median(1).values[:, None, None]).abs().amax(0)
+    return torch.where(off > NOISE, off, 0.0)
+
+
+class _ShapeBearing(ShapeMoments):
+    """Shape moments that also know where the thing that stands still is: the middle of what is not plain ground."""
+
+    anchor: Tensor
+
+    def __init__(self, size: int, channels: int = 3) -> None:
+        super().__init__(size, channels)
+        self.register_buffer("anchor", torch.zeros(2))
+
+    @torch.no_grad()
+    def fit(self, frames: Tensor) -> None:
+        """Take background, scales and place from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
+        super().fit(frames)
+        self.anchor.copy_(torch.stack(_centre(_still(self.background), self.axis)))
+
+
+class ShapeBearingEncoder(ShapeEncoder):
+    r"""Where the thing that stands still lies, seen from one thing of one colour, with a front and a back, that moves.
+
+    .. math:: z_t = \Big(\tanh \frac{1}{r} \begin{pmatrix} e_1 & e_2 \\ -e_2 & e_1 \end{pmatrix} (q - c_t), \; 0\Big) \in (-1, 1)^p
+
+    with the centre c and the direction e of :class:`ShapeEncoder`, the place q of the still thing (the middle of what is not plain
+    ground in the background) and a reach r. As with :class:`BearingEncoder` the latent has two numbers that the data fill, a still thing
+    counts as the disc around it, and entries beyond the second are zero and left to the memory. There is no weight to train;
+    :meth:`fit` takes the statistics from frames. Sizes that are not valid are a ConfigError. Source: paper eq. (7); the paper does
+    not give an architecture.
+
+    Args:
+        latent_dim: size p of the latent, at least two.
+        image_size: height and width of the frames in pixels; ``None`` accepts any size.
+        pool_to: height and width after average pooling.
+        velocity_gain: gain k of the difference of the two frames' centres, where the border of the frame cuts the thing.
+        reach: r, in half widths of the frame.
+
+    Example:
+        >>> ShapeBearingEncoder(latent_dim=2, image_size=128)(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
+        torch.Size([2, 2])
+    """
+
+    seen_dim = 2
+
+    def __init__(
+        self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, velocity_gain: float = 12.0, reach: float = 1.0
+    ) -> None:
+        if latent_dim < self.seen_dim or not reach > 0.0:
+            raise ConfigError(f"expected latent_dim >= 2 and reach > 0, received {latent_dim} and {reach}")
+        super().__init__(4, image_size, pool_to=pool_to, velocity_gain=velocity_gain)
+        self.latent_dim, self.reach = latent_dim, float(reach)
+        self.trunk, self.latent_head = nn.Sequential(_ShapeBearing(pool_to, self.in_channels)), nn.Sequential()
+        self.gain.data.fill_(1.0 / self.reach)
+        self.gain.requires_grad_(False)
+        kept = ("image_size", "pool_to", "velocity_gain")
+        self.arguments = {"latent_dim": latent_dim, **{k: self.arguments[k] for k in kept}, "reach": self.reach}
+
+    def _weight(self) -> Tensor:
+        return self.gain
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the moments of two successive frames; see :meth:`FrameEncoder.head`."""
+        moments: Any = self.trunk[0]
+        ahead, away = self.ahead(previous, current), moments.anchor - current[..., :2] * moments.scale[:2]
+        return F.pad(torch.tanh(self.gain * _turned(ahead, away)), (0, self.latent_dim - self.seen_dim))
+
+
+def _turned(ahead: Tensor, away: Tensor) -> Tensor:
+    """Places ``(*batch, 2)`` as seen in directions ``(*batch, 2)`` of length one: ahead and aside."""
+    across = ahead[..., 0] * away[..., 1] - ahead[..., 1] * away[..., 0]
+    return torch.stack([(ahead * away).sum(-1), across], -1)
 
 
 class Bearing(nn.Module):
@@ -376,8 +455,7 @@ class Bearing(nn.Module):
         """Take everything from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(background_of(frames))
         self._look()
-        off = (self.background - self.colours[1][:, None, None]).abs().amax(0)
-        thing = torch.where(off > NOISE, off, 0.0)
+        thing = _still(self.background)
         self.anchor.copy_(torch.stack(_centre(thing, self.axis)))
         self.ground.copy_(1.0 - F.max_pool2d((thing > 0.0).float()[None], 3, 1, 1)[0])
         self.light.copy_(((self.background + 1.0) * self.ground).sum((-2, -1)))
@@ -394,8 +472,7 @@ class Bearing(nn.Module):
         ahead = centres[..., 0] - centres[..., 1]
         ahead = ahead / ahead.norm(dim=-1, keepdim=True).clamp_min(1e-6)
         away = self.anchor - centres.mean(-1)
-        place = torch.stack([(ahead * away).sum(-1), ahead[:, 0] * away[:, 1] - ahead[:, 1] * away[:, 0]], -1)
-        return torch.cat([place, ahead], -1)
+        return torch.cat([_turned(ahead, away), ahead], -1)
 
 
 class BearingEncoder(MomentEncoder):

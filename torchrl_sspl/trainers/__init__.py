@@ -10,7 +10,7 @@ if TYPE_CHECKING:  # what readers of the source, type checkers among them, need 
     from torchrl_sspl.trainers.phases import Check, InnerLoop, Phase, Phases, Workspace
     from torchrl_sspl.trainers.selection import CheckRound, PlaceLevel
     from torchrl_sspl.trainers.source import Source, starts_of
-    from torchrl_sspl.trainers.steady import SteadyEncoder
+    from torchrl_sspl.trainers.steady import KeepChanges, SteadyEncoder
     from torchrl_sspl.trainers.synthesis import (
         FineTune,
         FitDynamics,
@@ -34,10 +34,10 @@ _NAMES = {
         "synthesis",
     ),
     "SSPLTrainer": "trainer",
-    "SteadyEncoder": "steady",
+    **dict.fromkeys(("KeepChanges", "SteadyEncoder"), "steady"),
 }
 __all__ = [
-    "Check", "CheckRound", "FineTune", "FitDynamics", "FitSets", "Gather", "InnerLoop", "Phase", "Phases", "PlaceLevel",
+    "Check", "CheckRound", "FineTune", "FitDynamics", "FitSets", "Gather", "InnerLoop", "KeepChanges", "Phase", "Phases", "PlaceLevel",
     "SSPLTrainer", "Settle", "Source", "SteadyEncoder", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "choose_and_spread", "starts_of",
     "synthesis_phases",
 ]  # fmt: skip

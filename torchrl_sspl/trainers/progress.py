@@ -20,7 +20,7 @@ PROGRESS_FILE = "progress.json"
 
 #: What the phases do, in words.
 WORDS = {
-    "steady": "steadying the encoder", "gather": "encoding what was seen", "dynamics": "fitting the latent dynamics", "teach": "teaching the policy",
+    "steady": "steadying the encoder", "changes": "encoding changed pictures", "gather": "encoding what was seen", "dynamics": "fitting the latent dynamics", "teach": "teaching the policy",
     "fit": "fitting safe set and policy", "steer": "steering the policy", "tune": "tuning both on the condition",
     "tighten": "training on counterexamples", "check": "checking on fresh episodes", "level": "placing the zero level",
 }  # fmt: skip

@@ -1,4 +1,4 @@
-"""A phase on pictures: the encoder learns to show of changed pictures what it shows of unchanged ones."""
+"""Phases on pictures: the encoder learns to show of changed pictures what it shows of unchanged ones, and what is left is kept."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.journal import Entry
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.trainers.phases import Phase, Workspace
 
@@ -22,7 +23,7 @@ class SteadyEncoder(Phase):
 
     with :math:`\bar E` the encoder of the joint training, and :math:`\tilde o` the picture o as a camera of :class:`Augmentation`
     captures it, drawn anew in every step. The data stay unchanged, so dynamics and barrier are fitted to clean latents; what changes
-    still do to latents is kept, and :class:`FineTune` pushes U out of the set by as much (:class:`Settle`, after targets on a grid, does not).
+    still do to latents is kept by :class:`KeepChanges`.
     Raises ConfigError without stored pictures, without changes,
     or if the encoder has nothing to train. Source: none (self-distillation).
     """
@@ -48,40 +49,58 @@ class SteadyEncoder(Phase):
             )
         n, device = len(store), trained[0].device
         if work.loop.step == 0:
-            work.latents = {"before": self._encoded(work, torch.arange(n))}
+            work.latents = {"before": _encoded(work, torch.arange(n))}
         before = work.latents["before"]
 
         def step() -> dict[str, Tensor]:
             rows = pick(n, _BATCH)
             frames = store.get(rows)["frames"][:, :2]
-            both = torch.cat([frames, self._changed(work, frames, int(pick(2**31 - 1, 1)))])
+            both = torch.cat([frames, _changed(work, frames, int(pick(2**31 - 1, 1)))])
             off = encoder(both.flatten(1, 2).to(device)) - before[rows].repeat(2, 1).to(device)
             return {"loss_steady": 2.0 * off.square().sum(1).mean()}
 
         work.loop(self.size(work), {encoder: _LR}, step)
+
+
+class KeepChanges(Phase):
+    """What changes of stored pictures still do to their latents, kept in ``work.changes``.
+
+    :class:`FineTune` pushes U out of the set by as much; :class:`Settle`, after targets on a grid, does not. Source: none.
+    """
+
+    name, pictures = "changes", True
+
+    def run(self, work: Workspace) -> None:
+        n = len(work.source.store)
         kept = torch.randint(n, (min(n, _KEPT),), generator=work.loop.generator)
-        after = self._encoded(work, torch.arange(n))
-        work.changes = self._encoded(work, kept, spawn(work.seed, "pictures", 1)) - after[kept]
-        spread, moved = work.changes.std(0), (after - before).std(0)
-        work.log({"step": self.size(work), "left_by_changes": spread.tolist(), "moved": moved.tolist()})
-
-    @staticmethod
-    def _changed(work: Workspace, frames: Tensor, seed: int) -> Tensor:
-        """Frames ``(n, 2, 3, H, W)`` as cameras with changes capture them, both of a picture by the same one."""
-        n = len(frames)
-        changed = work.source.changes.with_seed(seed)(frames.flatten(0, 1), torch.arange(n).repeat_interleave(2))
-        return changed.unflatten(0, (n, 2))
-
-    @torch.no_grad()
-    def _encoded(self, work: Workspace, rows: Tensor, seed: int | None = None) -> Tensor:
-        """Latents ``(k, p)`` of stored pictures, on the CPU; with a seed as cameras with changes capture them."""
-        device, found = next(work.encoder.parameters()).device, []
-        for k, part in enumerate(rows.split(_ENCODED)):
-            frames = work.source.store.get(part)["frames"][:, :2]
-            if seed is not None:
-                frames = self._changed(work, frames, seed + k)
-            found.append(work.encoder(frames.flatten(1, 2).to(device)).cpu())
-        return torch.cat(found)
+        after = _encoded(work, torch.arange(n))
+        work.changes = _encoded(work, kept, spawn(work.seed, "pictures", 1)) - after[kept]
+        spread, moved = work.changes.std(0), (after - work.latents["before"]).std(0)
+        work.log({"step": self.number, "left_by_changes": spread.tolist(), "moved": moved.tolist()})
 
 
-__all__ = ["SteadyEncoder"]
+def _changed(work: Workspace, frames: Tensor, seed: int) -> Tensor:
+    """Frames ``(n, 2, 3, H, W)`` as cameras with changes capture them, both of a picture by the same one."""
+    n = len(frames)
+    changed = work.source.changes.with_seed(seed)(frames.flatten(0, 1), torch.arange(n).repeat_interleave(2))
+    return changed.unflatten(0, (n, 2))
+
+
+@torch.no_grad()
+def _encoded(work: Workspace, rows: Tensor, seed: int | None = None) -> Tensor:
+    """Latents ``(k, p)`` of stored pictures, on the CPU; with a seed as cameras with changes capture them."""
+    device, entry = next(work.encoder.parameters()).device, Entry("pictures", seed, rows)
+    found = entry.saved() or []
+    parts = list(enumerate(rows.split(_ENCODED)))
+    for k, part in parts[len(found) :]:
+        frames = work.source.store.get(part)["frames"][:, :2]
+        if seed is not None:
+            frames = _changed(work, frames, seed + k)
+        found.append(work.encoder(frames.flatten(1, 2).to(device)).cpu())
+        if entry.due:
+            entry.save(found)
+    entry.save(found, complete=True)
+    return torch.cat(found)
+
+
+__all__ = ["KeepChanges", "SteadyEncoder"]

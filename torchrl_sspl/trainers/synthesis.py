@@ -37,7 +37,7 @@ from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.asking import choose_and_spread
 from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
-from torchrl_sspl.trainers.steady import SteadyEncoder
+from torchrl_sspl.trainers.steady import KeepChanges, SteadyEncoder
 from torchrl_sspl.trainers.targets import observed_errors, off_manifold, remembered, successors, targets, uniform
 from torchrl_sspl.viability.cloud import (
     reach_times,
@@ -538,7 +538,7 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
     """
     teach = [TeachPolicy] if config.teacher == "value" else []
     tighten = [Tighten] if config.tolerated_error > 0 else []
-    steady = [SteadyEncoder(0)] if config.steady_steps else []
+    steady = [SteadyEncoder(0), KeepChanges(0)] if config.steady_steps else []
     after = [Settle] if config.grid else [SteerPolicy, FineTune, *tighten]
     kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, *after, *([check] if check else [])]
     return [*steady, *(kind(k) for k in range(config.rounds) for kind in kinds)]
