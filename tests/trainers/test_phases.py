@@ -267,6 +267,15 @@ def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p
     assert_same(experiment(tmp_path / "killed", *car, EVERY_STEP).train(), expected)
 
 
+@pytest.mark.parametrize("encoder", ["BearingEncoder", "ShapeBearingEncoder"])
+def test_a_grid_of_latents_that_a_picture_shows_whole_trains(tmp_path, encoder):
+    car = ("env=cmu", "env.image_size=32", f"network.encoder={encoder}", "network.latent_dim=2", "network.remember_action=false",
+           "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
+    found = experiment(tmp_path, *car)
+    assert found.train().latent_dim == 2
+    assert found.work.seen_dim is None
+
+
 def test_a_memory_of_actions_needs_an_encoder_that_leaves_room_for_it(tmp_path):
     with pytest.raises(ConfigError, match="fills 2 of latent_dim=3"):
         experiment(tmp_path, "network.latent_dim=3", "network.remember_action=true")

@@ -203,7 +203,8 @@ class Workspace:
         self.logger: Any = None  # of TorchRL
         self.logged_step = 0
         self.where: dict[str, Any] = {"phase": "", "round": 0}
-        self.seen_dim: int | None = getattr(self.encoder, "seen_dim", None)
+        seen = getattr(self.encoder, "seen_dim", None)
+        self.seen_dim: int | None = None if seen == self.latent_dim else seen  # of a picture that does not show all of a latent
         self.direction = direction_of(self.originals["dynamics"])  # which entries of the latent are one
         self.gain = gain_matrix(self.config.gain, self.latent_dim, self.seen_dim)
         self.latents: dict[str, Tensor] = {}
