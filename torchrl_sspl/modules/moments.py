@@ -17,7 +17,7 @@ FAINT = 0.15  # the same of a bearing: the noise of a bad camera
 REACH = 1.5  # pixels of 64 by which a camera may be out of place
 _EDGE = 16  # of a frame's width: so many pixels have to speak for it
 _VAGUE = 0.03  # scaled length below which a direction is none
-WHOLE = 0.9  # of the usual covered share, from which a thing is seen as a whole
+WHOLE = 0.9  # of the largest difference, from which a pixel shows the whole colour of a thing
 
 
 def background_of(frames: Tensor) -> Tensor:
@@ -162,14 +162,14 @@ class MomentEncoder(Fitted):
 
 
 class ShapeMoments(nn.Module):
-    r"""Place and shape of what differs from the background: centre, third moment and size of the covered share.
+    r"""Place and shape of what differs from the background: centre, third moment, and whether the frame's border cuts it.
 
     .. math:: w = \max_k |f_k - b_k|, \qquad d = (x, y) - c, \qquad
-        h = \Big(\langle (x, y) \rangle, \;\langle |d|^2 d \rangle, \;\textstyle\sum w\Big) / \sigma
+        h = \Big(\langle (x, y) \rangle / \sigma_1, \;\langle |d|^2 d \rangle / \sigma_2, \;\big(1 - \max_{\text{border}} w\big)_+\Big)
 
     with averages over w. The third moment points along whatever has one end that is heavier than the other, such as an arrow
     of one colour. The largest difference over the colours counts, so that a thing covers the same share before every
-    background. Background b and usual size are medians; they and the other scales :math:`\sigma` come from frames alone and are set by :meth:`fit`.
+    background. Background b and the scales :math:`\sigma` come from frames alone and are set by :meth:`fit`.
     Source: none.
 
     Args:
@@ -210,7 +210,8 @@ class ShapeMoments(nn.Module):
 
         third_x = (columns * right**3).sum(-1, keepdim=True) / mass + mean(down**2, right)
         third_y = (rows * down**3).sum(-1, keepdim=True) / mass + mean(down, right**2)
-        return torch.cat([x, y, third_x, third_y, rows.sum(-1, keepdim=True)], -1)
+        border = torch.stack([weight[:, 0], weight[:, -1], weight[..., 0], weight[..., -1]]).amax((0, 2))
+        return torch.cat([x, y, third_x, third_y, (1.0 - border).clamp_min(0.0)[:, None]], -1)
 
     @torch.no_grad()
     def fit(self, frames: Tensor) -> None:
@@ -219,7 +220,7 @@ class ShapeMoments(nn.Module):
         found = in_parts(self.moments, frames)
         # One scale for both directions: turning the frame turns what is seen.
         pairs = found[:, :4].unflatten(-1, (2, 2)).square().mean((0, 2)).sqrt()
-        self.scale.copy_(torch.cat([pairs.repeat_interleave(2), found[:, 4:].median(0).values]).clamp_min(1e-8))
+        self.scale[:4] = pairs.repeat_interleave(2).clamp_min(1e-8)
 
     def forward(self, frames: Tensor) -> Tensor:
         """Scaled moments ``(n, 5)`` of frames ``(n, c, H, W)``."""
@@ -229,12 +230,12 @@ class ShapeMoments(nn.Module):
 class ShapeEncoder(MomentEncoder):
     r"""Frame encoder on moments, for a scene in which one thing of one colour, with a front and a back, moves.
 
-    .. math:: a_t = s^4 (m_{t-1} + m_t) / 2 + (1 - s^4) k (c_t - c_{t-1}), \qquad
+    .. math:: a_t = s_t m_t + (1 - s_t) \big(s_{t-1} m_{t-1} + (1 - s_{t-1}) k (c_t - c_{t-1})\big), \qquad
         h_t = (c_t, a_t / \|a_t\|), \qquad z_t = \tanh(g \, h_t + \operatorname{MLP}(h_t)) \in (-1, 1)^p
 
-    with centre c and third moment m of :class:`ShapeMoments`, and s in [0, 1] the share of the thing that is seen in both
-    frames. The shape tells the direction more exactly than the motion from one frame to the next, unless the border of the
-    frame cuts it. Before the training :meth:`fit` takes the statistics from frames; no label and no state enters. Sizes
+    with centre c and third moment m of :class:`ShapeMoments`, and s in [0, 1], one where all of the thing is seen. The shape
+    tells the direction more exactly than the motion from one frame to the next, unless the border of the frame cuts it; that
+    of the frame before says how it was a step ago. Before the training :meth:`fit` takes the statistics from frames; no label and no state enters. Sizes
     that are not valid are a ConfigError. Source: paper eq. (7); the paper does not give an architecture.
 
     Args:
@@ -267,9 +268,9 @@ class ShapeEncoder(MomentEncoder):
 
     def ahead(self, previous: Tensor, current: Tensor) -> Tensor:
         """Direction ``(*batch, 2)`` of the thing, of length one where it is known, from the moments of two successive frames."""
-        whole = (torch.minimum(previous, current)[..., 4:] / WHOLE).clamp(0.0, 1.0) ** 4
-        shape, motion = (previous + current)[..., 2:4] / 2, (current - previous)[..., :2]
-        ahead = whole * shape + (1 - whole) * self.velocity_gain * motion
+        ahead = self.velocity_gain * (current - previous)[..., :2]
+        for frame in (previous, current):
+            ahead = frame[..., 4:] * frame[..., 2:4] + (1.0 - frame[..., 4:]) * ahead
         return ahead / (ahead.square().sum(-1, keepdim=True) + _VAGUE**2).sqrt()
 
     def head(self, previous: Tensor, current: Tensor) -> Tensor:
