@@ -111,11 +111,11 @@ def with_worst(values, coeff, fraction):
     return sum(ordered) / len(ordered) + coeff * sum(ordered[:count]) / count
 
 
-def consistency_loss(predicted, actual, region, unsafe_weight, worst_coeff, worst_fraction):
+def consistency_loss(predicted, actual, region, unsafe_weight, outlier, worst_coeff, worst_fraction):
     """Loss, mean and largest error of the dynamics."""
-    squares = squared_distance(predicted, actual)[:, 0]
-    weighted = [(unsafe_weight if r == 2 else 1.0) * s for s, r in zip(squares, region[:, 0], strict=True)]
-    errors = [math.sqrt(s) for s in squares]
+    errors = [math.sqrt(s) for s in squared_distance(predicted, actual)[:, 0]]
+    counted = [e**2 if outlier is None or e <= outlier else 2 * outlier * e - outlier**2 for e in errors]
+    weighted = [(unsafe_weight if r == 2 else 1.0) * c for c, r in zip(counted, region[:, 0], strict=True)]
     return with_worst(weighted, worst_coeff, worst_fraction), sum(errors) / len(errors), max(errors)
 
 

@@ -103,19 +103,20 @@ def test_the_worst_rows_are_chosen_by_the_weighted_error():
 
 
 @pytest.mark.parametrize("unsafe_weight", [1.0, 0.1, 3.0])
+@pytest.mark.parametrize("outlier", [None, 0.8])
 @pytest.mark.parametrize("worst", [(0.0, 0.05), (0.2, 0.3)])
 @pytest.mark.parametrize("keep", [None, [True, False, True, True, False, True, True, False]])
-def test_consistency_equals_the_reference(unsafe_weight, worst, keep):
+def test_consistency_equals_the_reference(unsafe_weight, outlier, worst, keep):
     torch.manual_seed(0)
     data, dynamics = random_transitions(), Smooth(3, 2).double()
-    loss = ConsistencyLoss(dynamics, unsafe_weight=unsafe_weight, worst_coeff=worst[0], worst_fraction=worst[1])
+    loss = ConsistencyLoss(dynamics, unsafe_weight=unsafe_weight, outlier=outlier, worst_coeff=worst[0], worst_fraction=worst[1])
     with torch.no_grad():
         predicted = dynamics(data["latent"], data["action"]).numpy()
     if keep is not None:
         data["collector", "mask"] = torch.tensor(keep)
     rows = [k for k in range(len(data)) if keep is None or keep[k]]
     expected = reference.consistency_loss(
-        predicted[rows], data["next", "latent"].numpy()[rows], data["region"].numpy()[rows], unsafe_weight, *worst
+        predicted[rows], data["next", "latent"].numpy()[rows], data["region"].numpy()[rows], unsafe_weight, outlier, *worst
     )
     out = loss.double()(data)
     assert out["loss_consistency"].item() == pytest.approx(expected[0], rel=1e-6)
@@ -123,10 +124,24 @@ def test_consistency_equals_the_reference(unsafe_weight, worst, keep):
     assert out["dynamics_error_max"].item() == pytest.approx(expected[2], rel=1e-6)
 
 
+def test_an_outlier_counts_in_proportion_and_has_a_finite_gradient():
+    out = ConsistencyLoss(Adds(), outlier=0.15)(by_hand())  # errors 0, 0.1, 0.3 and 0.2
+    assert out["loss_consistency"].item() == pytest.approx((0.1**2 + 0.3 * 0.3 - 0.15**2 + 0.3 * 0.2 - 0.15**2) / 4)
+    assert out["dynamics_error_max"].item() == pytest.approx(0.3)
+    dynamics = Smooth(3, 2).double()
+    data = random_transitions(4)
+    data["next", "latent"] = dynamics(data["latent"], data["action"]).detach()  # no error at all
+    ConsistencyLoss(dynamics, outlier=0.1).double()(data)["loss_consistency"].backward()
+    assert all(p.grad.isfinite().all() for p in dynamics.parameters())
+    for wrong in (0.0, -1.0, float("nan")):
+        with pytest.raises(ConfigError, match="outlier > 0 or None"):
+            ConsistencyLoss(Adds(), outlier=wrong)
+
+
 def test_gradients_of_consistency_are_those_of_the_formula():
     torch.manual_seed(0)
     data = random_transitions(6)
-    loss = ConsistencyLoss(Smooth(3, 2), unsafe_weight=0.3, worst_coeff=0.5, worst_fraction=0.3).double()
+    loss = ConsistencyLoss(Smooth(3, 2), unsafe_weight=0.3, outlier=0.8, worst_coeff=0.5, worst_fraction=0.3).double()
 
     def value(*_: Tensor) -> Tensor:
         return loss(data)["loss_consistency"]

@@ -191,6 +191,8 @@ class SynthesisConfig:
     dynamics_steps: int = _option(1500, "optimiser steps of the refit of the latent dynamics.")
     unsafe_weight: float = _option(1.0, "weight of transitions that start in U in the refit of the dynamics; below 1 "
         "where the pictures there are not worth the networks' capacity (a robot in front of the obstacle that it stands on).")
+    dynamics_outlier: float = _option(0.0, "error of the dynamics, latent units, beyond which it counts in proportion in their refit, no longer squared, "
+        "where some pictures show less than the state (a robot cut by the border of the frame). 0: never.")
     tube_radius: float = _option(0.3, "distance from the data up to which a latent off the manifold may belong to the "
         "safe set.")
     grid: int = _option(0, "nodes per entry that pictures show of a grid over the latent domain, on which the barrier's targets are found "

@@ -18,14 +18,16 @@ from torchrl_sspl.sets import UNSAFE
 class ConsistencyLoss(LatentLoss):
     r"""Prediction error of the latent dynamics on frozen latents.
 
-    .. math:: L = \operatorname{mean}_D\, w \| z_{t+1} - d(z_t, u_t) \|^2, \qquad w = w_U \text{ on } U, \text{ else } 1
+    .. math:: L = \operatorname{mean}_D\, w \, h(\| z_{t+1} - d(z_t, u_t) \|), \qquad w = w_U \text{ on } U, \text{ else } 1, \qquad
+        h(e) = \begin{cases} e^2 & e \le \delta \\ 2 \delta e - \delta^2 & e > \delta \end{cases}
 
     Output: ``loss_consistency`` and the detached metrics ``dynamics_error`` and ``dynamics_error_max`` (2-norms).
-    Source: paper eq. (8), third term, with the encoder frozen; deviation: the weight of U, and the worst rows.
+    Source: paper eq. (8), third term, with the encoder frozen; deviation: the weight of U, the outliers, and the worst rows.
 
     Args:
         dynamics: (latent, action) -> next latent ``(*batch, p)``.
         unsafe_weight: :math:`w_U`, weight of transitions that start in U.
+        outlier: :math:`\delta`, error beyond which a picture is taken to show less than the state; None: no error is.
         **shared: ``worst_coeff``, ``worst_fraction``, ``reduction``; see :class:`LatentLoss`, for errors too.
 
     Example:
@@ -37,11 +39,14 @@ class ConsistencyLoss(LatentLoss):
         ['dynamics_error', 'dynamics_error_max', 'loss_consistency']
     """
 
-    def __init__(self, dynamics: nn.Module, *, unsafe_weight: float = 1.0, **shared: Any) -> None:
+    def __init__(self, dynamics: nn.Module, *, unsafe_weight: float = 1.0, outlier: float | None = None, **shared: Any) -> None:
         if not unsafe_weight > 0:
             raise ConfigError(f"expected unsafe_weight > 0, received {unsafe_weight}")
+        if outlier is not None and not outlier > 0:
+            raise ConfigError(f"expected outlier > 0 or None, received {outlier}")
         super().__init__(dynamics=dynamics, **shared)
         self.register_buffer("unsafe_weight", torch.tensor(float(unsafe_weight)))
+        self.outlier = outlier
         self._needs |= {"action", "region", "next_latent"}
         self.out_keys += ["loss_consistency", "dynamics_error", "dynamics_error_max"]
 
@@ -53,7 +58,11 @@ class ConsistencyLoss(LatentLoss):
     def terms(self, batch: LatentBatch) -> dict[str, Tensor]:
         """The same for latents that have been read: what a loop of thousands of small steps calls."""
         error = consistency_error(self._run("dynamics", batch.latent, batch.action), batch.next_latent)
-        weighted = torch.where(batch.region == UNSAFE, self.unsafe_weight * error, error)
+        counted = error
+        if self.outlier is not None:
+            far = 2.0 * self.outlier * error.clamp_min(self.outlier**2).sqrt() - self.outlier**2
+            counted = torch.where(error > self.outlier**2, far, error)
+        weighted = torch.where(batch.region == UNSAFE, self.unsafe_weight * counted, counted)
         norm = error.detach().sqrt()
         if batch.valid is not None:
             norm = torch.where(batch.valid, norm, 0.0)

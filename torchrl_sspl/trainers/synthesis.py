@@ -175,7 +175,9 @@ class FitDynamics(_Training):
         rows = data["latent"][:0] if s.grid else data["latent"]
         tube, base = off_manifold(work, rows, 1.3 * s.tube_radius, self.number)
         on, off = (2 * s.batch // 6, s.batch // 6) if not work.observing else (s.batch // 4, s.batch)
-        loss = ConsistencyLoss(work.dynamics, unsafe_weight=s.unsafe_weight, worst_coeff=0.2, worst_fraction=0.05)
+        loss = ConsistencyLoss(
+            work.dynamics, unsafe_weight=s.unsafe_weight, outlier=s.dynamics_outlier or None, worst_coeff=0.2, worst_fraction=0.05
+        )
 
         latent, after, action, region = (data[k] for k in ("latent", "next_latent", "action", "region"))
         pieces = _pieces(data["continues"]) if work.observing else None
