@@ -139,4 +139,4 @@ def test_the_settings_train_this_car_from_its_pictures_alone(tmp_path):
     experiment = Experiment(config)
     assert isinstance(experiment.env, CMUDubinsEnv)
     agent = experiment.train()
-    assert agent.encode(experiment.env.observe(experiment.env.sample_states(3))).shape == (3, 4)
+    assert agent.encode(experiment.env.observe(experiment.env.sample_states(3))).shape == (3, 2)
