@@ -329,15 +329,10 @@ class ShapeBearingEncoder(ShapeEncoder):
     def __init__(
         self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, velocity_gain: float = 12.0, reach: float = 1.0
     ) -> None:
-        if latent_dim < self.seen_dim or not reach > 0.0:
-            raise ConfigError(f"expected latent_dim >= 2 and reach > 0, received {latent_dim} and {reach}")
         super().__init__(4, image_size, pool_to=pool_to, velocity_gain=velocity_gain)
-        self.latent_dim, self.reach = latent_dim, float(reach)
-        self.trunk, self.latent_head = nn.Sequential(_ShapeBearing(pool_to, self.in_channels)), nn.Sequential()
-        self.gain.data.fill_(1.0 / self.reach)
-        self.gain.requires_grad_(False)
+        _show_bearings(self, _ShapeBearing(pool_to, self.in_channels), latent_dim, reach)
         kept = ("image_size", "pool_to", "velocity_gain")
-        self.arguments = {"latent_dim": latent_dim, **{k: self.arguments[k] for k in kept}, "reach": self.reach}
+        self.arguments = {"latent_dim": latent_dim, **{k: self.arguments[k] for k in kept}, "reach": float(reach)}
 
     def _weight(self) -> Tensor:
         return self.gain
@@ -347,6 +342,16 @@ class ShapeBearingEncoder(ShapeEncoder):
         moments: Any = self.trunk[0]
         ahead, away = self.ahead(previous, current), moments.anchor - current[..., :2] * moments.scale[:2]
         return F.pad(torch.tanh(self.gain * _turned(ahead, away)), (0, self.latent_dim - self.seen_dim))
+
+
+def _show_bearings(encoder: Any, seen: nn.Module, latent_dim: int, reach: float) -> None:
+    """Gives an encoder the latent of two numbers that the data fill, without a weight to train."""
+    if latent_dim < 2 or not reach > 0.0:
+        raise ConfigError(f"expected latent_dim >= 2 and reach > 0, received {latent_dim} and {reach}")
+    encoder.latent_dim, encoder.reach = latent_dim, float(reach)
+    encoder.trunk, encoder.latent_head = nn.Sequential(seen), nn.Sequential()
+    encoder.gain.data.fill_(1.0 / encoder.reach)
+    encoder.gain.requires_grad_(False)
 
 
 def _turned(ahead: Tensor, away: Tensor) -> Tensor:
@@ -504,14 +509,10 @@ class BearingEncoder(MomentEncoder):
     def __init__(
         self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, reach: float = 0.625
     ) -> None:
-        if latent_dim < self.seen_dim or not reach > 0.0:
-            raise ConfigError(f"expected latent_dim >= 2 and reach > 0, received {latent_dim} and {reach}")
         super().__init__(self.seen_dim, image_size, pool_to=pool_to)
-        self.latent_dim, self.reach, self.features = latent_dim, float(reach), 4
-        self.trunk, self.latent_head = nn.Sequential(Bearing(pool_to, self.in_channels)), nn.Sequential()
-        self.gain.data.fill_(1.0 / self.reach)
-        self.gain.requires_grad_(False)
-        self.arguments = {"latent_dim": latent_dim, "image_size": self.arguments["image_size"], "pool_to": pool_to, "reach": self.reach}
+        _show_bearings(self, Bearing(pool_to, self.in_channels), latent_dim, reach)
+        self.features = 4
+        self.arguments = {"latent_dim": latent_dim, "image_size": self.arguments["image_size"], "pool_to": pool_to, "reach": float(reach)}
 
     def _weight(self) -> Tensor:
         return self.gain
