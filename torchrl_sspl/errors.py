@@ -64,5 +64,9 @@ class MissingDependencyError(SSPLError, ImportError):
     """An optional dependency is not installed."""
 
 
+class WorkerError(SSPLError, RuntimeError):
+    """A process that works for this one has ended."""
+
+
 class SolverError(SSPLError, RuntimeError):
     """A numerical solver did not return a valid solution."""

@@ -2,6 +2,13 @@
 
 from __future__ import annotations
 
+import gc
+import os
+import signal
+import time
+from functools import partial
+from pathlib import Path
+
 import gymnasium
 import numpy as np
 import pytest
@@ -11,8 +18,9 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_sspl.data import collect_random
-from torchrl_sspl.envs.gymnasium import GymnasiumPixels, _area_averaged
-from torchrl_sspl.errors import ConfigError, OverlapError
+from torchrl_sspl.envs.games import area_averaged
+from torchrl_sspl.envs.gymnasium import GymnasiumPixels
+from torchrl_sspl.errors import ConfigError, OverlapError, WorkerError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 
@@ -84,7 +92,7 @@ def test_systems_at_rest_start_where_they_are_put():
     data = env.reset()
     assert torch.equal(data["pixels"][0, :3], data["pixels"][0, 3:])
     assert data["state"].item() == 6.0
-    assert not env._envs[0].actions
+    assert not env._games.games[0].env.actions
 
 
 def test_reset_options_may_be_drawn():
@@ -98,7 +106,7 @@ def test_actions_are_distances_from_the_middle_of_the_box_and_clamped():
     env.reset()
     for action, native in ((0.0, 2.0), (-2.0, 0.0), (1.5, 3.5), (99.0, 4.0)):
         env.step(TensorDict(action=torch.tensor([[action]]), batch_size=[1]))
-        assert env._envs[0].actions[-1] == pytest.approx(native)
+        assert env._games.games[0].env.actions[-1] == pytest.approx(native)
     assert env.max_action == 2.0
 
 
@@ -113,7 +121,7 @@ def test_discrete_actions_cut_the_interval_into_equal_parts(action, choice):
     env = slider(1, make=lambda: Slider(spaces.Discrete(3, start=5)))
     env.reset()
     env.step(TensorDict(action=torch.tensor([[action]]), batch_size=[1]))
-    assert env._envs[0].actions[-1] == choice
+    assert env._games.games[0].env.actions[-1] == choice
 
 
 @pytest.mark.parametrize(
@@ -124,7 +132,7 @@ def test_neighbouring_numbers_mix_where_actions_repeat(action, choices):
     env = slider(1, make=lambda: Slider(spaces.Discrete(3, start=5)), action_repeat=2, settle=False)
     env.reset()
     env.step(TensorDict(action=torch.tensor([[action]]), batch_size=[1]))
-    assert env._envs[0].actions == choices
+    assert env._games.games[0].env.actions == choices
 
 
 def test_same_seed_gives_the_same_episodes_and_another_seed_others():
@@ -225,4 +233,86 @@ def test_pictures_are_averaged_as_torch_does_it_bit_for_bit(shape, size):
         area = torch.nn.functional.interpolate(channels, size=(size, size), mode="area")[0].add(0.5).to(torch.uint8)
         by_columns = np.ascontiguousarray(picture.transpose(1, 0, 2)).transpose(1, 0, 2)
         for same in (picture, by_columns):
-            assert torch.equal(torch.from_numpy(_area_averaged(same, size)).permute(2, 0, 1), area)
+            assert torch.equal(torch.from_numpy(area_averaged(same, size)).permute(2, 0, 1), area)
+
+
+spread = pytest.mark.skipif(not hasattr(os, "fork"), reason="environments are spread by forking")
+
+
+@spread
+def test_environments_in_other_processes_show_the_same():
+    def drawn(random):
+        return {"x": float(random.integers(0, 16))}
+
+    def seen(workers):
+        make = partial(Slider, lifetime=5)  # some end, and begin again by themselves
+        env = slider(5, make=make, workers=workers, reset_options=drawn, horizon=7)
+        env.set_seed(3)
+        data = env.rollout(12, policy=lambda td: td.set("action", torch.linspace(-2, 2, 5)[:, None]), break_when_any_done=False)
+        env.close()
+        return data
+
+    here, elsewhere = seen(1), seen(3)
+    assert (here == elsewhere).all()
+
+
+def running(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@spread
+@pytest.mark.parametrize("end", [GymnasiumPixels.close, lambda env: None], ids=["closed", "forgotten"])
+def test_processes_end_with_the_environment(end):
+    env = slider(4, workers=2)
+    processes = env._games.processes
+    assert [running(pid) for pid in processes] == [True, True]
+    end(env)
+    del env
+    gc.collect()
+    assert not any(map(running, processes))
+
+
+@spread
+def test_processes_end_with_their_parent():
+    read, write = os.pipe()
+    parent = os.fork()
+    if parent == 0:  # one that is killed has no time to close anything
+        env = slider(4, workers=2)
+        os.write(write, repr(env._games.processes).encode())
+        os.kill(os.getpid(), signal.SIGKILL)
+    os.waitpid(parent, 0)
+    processes = eval(os.read(read, 100))
+    until = time.monotonic() + 10
+    while any(map(running, processes)) and time.monotonic() < until:
+        time.sleep(0.05)
+    assert len(processes) == 2
+    assert not any(map(running, processes))
+
+
+@spread
+def test_what_goes_wrong_in_another_process_is_told():
+    with pytest.raises(ConfigError, match="render_mode='rgb_array'"):
+        slider(2, make=lambda: gymnasium.make("CartPole-v1"), workers=2)
+    with pytest.raises(OverlapError, match="exclude each other"):
+        slider(workers=2, unsafe=lambda state, info: True, reset_options={"x": 1.0}).reset()
+    with pytest.raises(ConfigError, match="survives one step"):
+        slider(make=lambda: Slider(lifetime=1), workers=2).reset()
+    with pytest.raises(ConfigError, match="workers"):
+        slider(workers=0)
+    env = slider(workers=2)
+    env.reset()
+    os.kill(env._games.processes[1], signal.SIGKILL)
+    with pytest.raises(WorkerError, match="workers=1"):
+        env.step(TensorDict(action=torch.zeros(2, 1), batch_size=[2]))
+
+
+@spread
+def test_an_interrupted_question_leaves_no_answer_to_the_next():
+    env = slider(2, workers=2, reset_options={"x": 6.0}, settle=False)
+    env.reset()
+    env._games._pipes[0].send((env._games._asked, "step", {0: ([4.0],)}))  # asked, and its answer never fetched
+    data = env.step(TensorDict(action=torch.full((2, 1), 1.0), batch_size=[2]))["next"]
+    assert data["state"].flatten().tolist() == [9.0, 7.0]

@@ -448,6 +448,7 @@ def gymnasium_env(
     settle: bool = True,
     ignore_termination: bool = False,
     reset_options: str | None = None,
+    workers: int = 1,
     seed: int | None = None,
 ) -> Any:
     """Environment of gymnasium whose parts are named by import paths.
@@ -463,6 +464,7 @@ def gymnasium_env(
         settle: see ``GymnasiumPixels``.
         ignore_termination: let episodes go on where gymnasium ends them, up to the horizon.
         reset_options: "package.module:function" of a random generator that gives the options of a reset.
+        workers: processes that step and draw the environments.
         seed: of the resets.
 
     Returns the environment. Raises ConfigError if a predicate is missing or a path cannot be imported. Source: none.
@@ -478,7 +480,7 @@ def gymnasium_env(
     return GymnasiumPixels(
         _Make(make), safe=resolve(safe), unsafe=resolve(unsafe), batch_size=batch_size, image_size=image_size,
         horizon=horizon, reset_options=resolve(reset_options) if reset_options else None, action_repeat=action_repeat,
-        settle=settle, ignore_termination=ignore_termination, seed=seed,
+        settle=settle, ignore_termination=ignore_termination, workers=workers, seed=seed,
     )  # fmt: skip
 
 

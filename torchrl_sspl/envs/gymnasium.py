@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,9 @@ from torchrl.envs import EnvBase
 
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import set_specs
-from torchrl_sspl.errors import ConfigError, OverlapError
-from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+from torchrl_sspl.envs.games import Game, Games, Moment, Picture, Predicate, SpreadGames
+from torchrl_sspl.errors import ConfigError
 
-Predicate = Callable[[Any, Mapping[str, Any]], Any]
 _ATTEMPTS = 20
 
 
@@ -50,7 +50,7 @@ class GymnasiumPixels(EnvBase):
     Args:
         make: ``() -> gymnasium.Env``, with ``render_mode="rgb_array"`` unless it observes pictures; called n times.
         safe, unsafe: ``(observation, info) -> bool`` of what gymnasium returns, the sets S and U.
-        batch_size: ``[n]`` environments, stepped one after the other.
+        batch_size: ``[n]`` environments, stepped one after the other in each of the ``workers``.
         image_size: height and width of the frames, in pixels; pictures are averaged down to it.
         horizon: steps after which an episode is truncated; ``None`` leaves that to gymnasium.
         reset_options: ``options`` of gymnasium's reset, or ``(numpy generator) -> options``.
@@ -60,6 +60,8 @@ class GymnasiumPixels(EnvBase):
         settle: let one step pass after a reset.
         ignore_termination: let episodes go on where gymnasium ends them, up to ``horizon``: where it ends them in U, no
             transition would start there. The system has to bear it (those of gymnasium do, with a warning).
+        workers: processes that step and draw the environments, at most n; one: this one. More show the same, sooner where
+            drawing takes the time. They are forked, so a system without fork has one, and ``make`` is called in them.
         device, seed: device of the tensors, and seed of the resets.
 
     Raises ConfigError if the environment cannot draw itself, or its action space is neither a bounded ``Box`` nor
@@ -91,6 +93,7 @@ class GymnasiumPixels(EnvBase):
         action_repeat: int = 1,
         settle: bool = True,
         ignore_termination: bool = False,
+        workers: int = 1,
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
@@ -105,6 +108,8 @@ class GymnasiumPixels(EnvBase):
             raise ConfigError("horizon: expected an integer >= 1 with ignore_termination, received None.")
         if not isinstance(image_size, int) or image_size < 8:
             raise ConfigError(f"image_size: expected an integer >= 8, received {image_size!r}.")
+        if not isinstance(workers, int) or workers < 1:
+            raise ConfigError(f"workers: expected an integer >= 1, received {workers!r}.")
         if not callable(make):
             raise ConfigError(
                 "make: expected a function that makes an environment of gymnasium, such as partial(gymnasium.make, "
@@ -113,27 +118,21 @@ class GymnasiumPixels(EnvBase):
         super().__init__(device=usable_device(device or "cpu"), batch_size=size)
         os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
         self.image_size, self.horizon = image_size, horizon
-        self.reset_options, self.settle, self.ignore_termination = reset_options, settle, ignore_termination
-        self.action_repeat = action_repeat
-        self._safe, self._unsafe = safe, unsafe
-        self._envs = [make() for _ in range(size[0])]
-        first = self._envs[0]
-        space = first.observation_space
-        shape: tuple[int, ...] = getattr(space, "shape", None) or ()
-        self._observes_pictures = len(shape) == 3 and shape[2] == 3 and space.dtype == np.uint8
-        if not self._observes_pictures and getattr(first, "render_mode", None) != "rgb_array":
-            raise ConfigError(
-                f"make: expected an environment with render_mode='rgb_array', received "
-                f"{getattr(first, 'render_mode', None)!r}; give it to gymnasium.make."
-            )
-        self._read_action_space(first.action_space)
+        self.reset_options, self.settle, self.action_repeat = reset_options, settle, action_repeat
+        n, workers = size[0], min(workers, size[0])
+        build = partial(
+            Game, make, safe=safe, unsafe=unsafe, image_size=image_size, ignore_termination=ignore_termination
+        )
+        self._games = Games(build, n) if workers == 1 else SpreadGames(build, n, workers)
+        observed, acted = self._games.ask("spaces", {0: ()})[0]
+        self._read_action_space(acted)
+        shape: tuple[int, ...] = getattr(observed, "shape", None) or ()
         self.state_dim = shape[0] if len(shape) == 1 else 0
         set_specs(self, image_size, self.state_dim, torch.tensor(self._scale, device=self.device))
         self._random = np.random.default_rng(seed)
-        n = size[0]
         self._frame = torch.zeros(n, 3, image_size, image_size, dtype=torch.uint8)
         self._steps = [0] * n
-        self._last: list[dict[str, Any]] = [{} for _ in range(n)]
+        self._last: dict[int, Moment] = {}
 
     def _read_action_space(self, space: Any) -> None:
         self._choices: int | None = None
@@ -166,39 +165,6 @@ class GymnasiumPixels(EnvBase):
             return [self._start + lower + (step < more) for step in range(repeat)]
         return [(self._middle + bounded).reshape(self._action_shape).astype(self._action_dtype)] * repeat
 
-    def _draw(self, index: int, observation: Any) -> Tensor:
-        shown = observation if self._observes_pictures else self._envs[index].render()
-        picture = np.asarray(shown)
-        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-            raise ConfigError(
-                f"render: expected a uint8 picture (height, width, 3), received {picture.dtype} {picture.shape}."
-            )
-        if picture.shape[:2] != (self.image_size, self.image_size):
-            picture = _area_averaged(picture, self.image_size)
-        else:
-            picture = picture.copy()  # some renderers draw into the same memory again
-        return torch.from_numpy(picture).permute(2, 0, 1)
-
-    def _region(self, observation: Any, info: Mapping[str, Any]) -> int:
-        judges = (("safe", self._safe), ("unsafe", self._unsafe))
-        safe, unsafe = (self._judged(name, predicate, observation, info) for name, predicate in judges)
-        if safe and unsafe:
-            raise OverlapError(
-                "safe and unsafe: expected predicates that exclude each other, received a state that both claim; "
-                "make one of them smaller."
-            )
-        return SAFE if safe else UNSAFE if unsafe else UNLABELLED
-
-    @staticmethod
-    def _judged(name: str, predicate: Predicate, observation: Any, info: Mapping[str, Any]) -> bool:
-        try:
-            return bool(predicate(observation, info))
-        except (TypeError, ValueError, LookupError) as error:
-            raise ConfigError(
-                f"{name}: expected a predicate (observation, info) -> bool of one state, received "
-                f"{type(error).__name__}: {error}"
-            ) from error
-
     def _options(self) -> dict[str, Any] | None:
         try:
             options = self.reset_options(self._random) if callable(self.reset_options) else self.reset_options
@@ -209,45 +175,22 @@ class GymnasiumPixels(EnvBase):
                 f"{type(error).__name__}: {error}"
             ) from error
 
-    def _advance(self, env: Any, action: np.ndarray) -> tuple[Any, float, bool, bool, Mapping[str, Any]]:
-        """``action_repeat`` steps of gymnasium; rewards add up, the end of an episode ends them too."""
-        total = 0.0
-        for native in self._native_actions(action):
-            observation, reward, terminated, truncated, info = env.step(native)
-            total += float(reward)
-            terminated = bool(terminated) and not self.ignore_termination
-            if terminated or truncated:
-                break
-        return observation, total, terminated, bool(truncated), info
-
-    def _restart(self, index: int) -> Tensor:
-        """Reset one environment and, to settle it, let one step pass; returns the frame of the reset."""
-        env = self._envs[index]
+    def _restart(self, rows: list[int]) -> dict[int, Tensor]:
+        """Resets some environments and, to settle them, lets one step pass; returns the frames of the reset."""
+        before, waiting = dict[int, Tensor](), rows
+        settling = self._native_actions(np.zeros(self.action_dim)) if self.settle else ()
         for _ in range(_ATTEMPTS):
-            options = self._options()
-            seed = int(self._random.integers(2**31 - 1))
-            observation, info = env.reset(seed=seed, options=options)
-            before = self._draw(index, observation)
-            if not self.settle:
-                break
-            observation, _, terminated, truncated, info = self._advance(env, np.zeros(self.action_dim))
-            if not (terminated or truncated):
-                break
-        else:
-            raise ConfigError(
-                f"reset: expected an episode that survives one step, received {_ATTEMPTS} that did not; "
-                "change reset_options."
-            )
-        self._frame[index] = self._draw(index, observation)
-        self._steps[index] = 0
-        self._last[index] = self._row(observation, info)
-        return before
-
-    def _row(self, observation: Any, info: Mapping[str, Any]) -> dict[str, Any]:
-        row: dict[str, Any] = {"region": self._region(observation, info)}
-        if self.state_dim:
-            row["state"] = np.asarray(observation, np.float32)
-        return row
+            drawn = {k: (self._options(), int(self._random.integers(2**31 - 1))) for k in waiting}
+            began = self._games.ask("reset", {k: (seed, options, settling) for k, (options, seed) in drawn.items()})
+            for k, (picture, moment) in began.items():
+                before[k], self._frame[k] = _frame(picture), _frame(moment.picture)
+                self._steps[k], self._last[k] = 0, moment
+            waiting = [k for k, (_, moment) in began.items() if moment.terminated or moment.truncated]
+            if not waiting:
+                return before
+        raise ConfigError(
+            f"reset: expected an episode that survives one step, received {_ATTEMPTS} that did not; change reset_options."
+        )
 
     def _set_seed(self, seed: int | None) -> None:
         self._random = np.random.default_rng(seed)
@@ -258,61 +201,40 @@ class GymnasiumPixels(EnvBase):
             chosen = tensordict["_reset"].reshape(-1).tolist()
             rows = [k for k in rows if chosen[k]]
         previous = self._frame.clone()
-        for k in rows:
-            previous[k] = self._restart(k)
+        for k, frame in self._restart(rows).items():
+            previous[k] = frame
         return self._output(previous)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict["action"].detach().cpu().reshape(-1, self.action_dim).numpy()
         previous, self._frame = self._frame, torch.empty_like(self._frame)
-        rewards, ended, cut = [], [], []
-        for k, env in enumerate(self._envs):
-            observation, reward, terminated, truncated, info = self._advance(env, actions[k])
-            self._frame[k] = self._draw(k, observation)
+        self._last = self._games.ask("step", {k: (self._native_actions(row),) for k, row in enumerate(actions)})
+        for k, moment in self._last.items():
+            self._frame[k] = _frame(moment.picture)
             self._steps[k] += 1
-            self._last[k] = self._row(observation, info)
-            rewards.append(reward)
-            ended.append(terminated)
-            cut.append(truncated or (self.horizon is not None and self._steps[k] >= self.horizon))
+        moments = [self._last[k] for k in range(len(actions))]
         out = self._output(previous)
-        over, late = (torch.tensor(v, device=self.device)[:, None] for v in (ended, cut))
-        out["reward"] = torch.tensor(rewards, device=self.device)[:, None]
-        out["terminated"], out["truncated"], out["done"] = over, late, over | late
+        late = [m.truncated or (self.horizon is not None and n >= self.horizon) for m, n in zip(moments, self._steps, strict=True)]
+        over, cut = (torch.tensor(v, device=self.device)[:, None] for v in ([m.terminated for m in moments], late))
+        out["reward"] = torch.tensor([m.reward for m in moments], device=self.device)[:, None]
+        out["terminated"], out["truncated"], out["done"] = over, cut, over | cut
         return out
 
     def _output(self, previous: Tensor) -> TensorDict:
+        moments = [self._last[k] for k in range(self.batch_size[0])]
         entries = {
             "pixels": torch.cat([previous, self._frame], dim=1),
-            "region": torch.tensor([row["region"] for row in self._last])[:, None],
+            "region": torch.tensor([m.region for m in moments])[:, None],
         }
         if self.state_dim:
-            entries["state"] = torch.from_numpy(np.stack([row["state"] for row in self._last]))
+            entries["state"] = torch.from_numpy(np.stack([m.state for m in moments if m.state is not None]))
         return TensorDict(entries, batch_size=self.batch_size).to(self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close the environments of gymnasium too."""
-        for env in self._envs:
-            env.close()
+        """Close the environments of gymnasium too, and the processes that step them."""
+        self._games.close()
         super().close(raise_if_closed=raise_if_closed)
 
 
-def _area_averaged(picture: np.ndarray, size: int) -> np.ndarray:
-    """A uint8 picture ``(h, w, 3)`` as ``(size, size, 3)``: bit for bit torch's mode "area", rounded, and faster."""
-    turned = picture.strides[0] < picture.strides[1]  # pygame's pictures lie in memory column by column
-    first, n = _summed(picture.transpose(1, 0, 2) if turned else picture, size)
-    second, m = _summed(first.transpose(1, 0, 2), size)
-    high, wide = (m, n) if turned else (n, m)
-    mean = (second if turned else second.transpose(1, 0, 2)).astype(np.float32) / high[:, None, None] / wide[:, None]
-    return (mean + np.float32(0.5)).astype(np.uint8)
-
-
-def _summed(values: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sums over ``size`` bins of the first axis, which may share a row, and how many rows each has (float32)."""
-    n, bins = len(values), np.arange(size)
-    first = bins * n // size
-    counts = -(-(bins + 1) * n // size) - first
-    sums = values[first].astype(np.uint32)
-    for k in range(1, int(counts.max())):
-        longer = counts > k
-        sums[longer] += values[first[longer] + k]
-    return sums, counts.astype(np.float32)
+def _frame(picture: Picture) -> Tensor:
+    return torch.from_numpy(picture).permute(2, 0, 1)

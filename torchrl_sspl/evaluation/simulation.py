@@ -325,7 +325,9 @@ def _one_batch(acts: Controller, env: EnvBase, k: int, horizon: int, film: int, 
     keep(data, decision)
     for t in range(horizon):
         before = decision
-        stepped, data = env.step_and_maybe_reset(data.set("action", decision.action.to(env.device)))
+        acted = data.set("action", decision.action.to(env.device))
+        # Whoever comes to the end with the last step needs no other beginning.
+        stepped, data = env.step_and_maybe_reset(acted) if t < horizon - 1 else (env.step(acted), acted)
         following = stepped["next"]
         ended = following["done"][:, 0].cpu()
         over = t == horizon - 1 or not bool((alive & ~ended).any())
