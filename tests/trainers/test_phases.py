@@ -256,6 +256,8 @@ def test_targets_on_a_grid_are_settled_in_place_of_a_fine_tuning():
     kinds = [type(phase) for phase in synthesis_phases(SynthesisConfig(grid=9, tolerated_error=0.01))]
     assert kinds[-1] is Settle
     assert not {synthesis.FineTune, synthesis.SteerPolicy, synthesis.Tighten} & set(kinds)
+    as_fitted = synthesis_phases(SynthesisConfig(grid=9, tolerated_error=0.01, tighten_steps=0))
+    assert [type(phase) for phase in as_fitted] == kinds[:-1]
 
 
 @pytest.mark.parametrize(("encoder", "p"), [("BearingEncoder", 3), ("TurnedBearingEncoder", 5)])

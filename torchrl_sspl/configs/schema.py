@@ -219,7 +219,7 @@ class SynthesisConfig:
     fit_steps: int = _option(1500, "steps in which barrier and policy are regressed onto their targets.")
     steer_steps: int = _option(300, "steps of the policy alone on the condition, with the barrier held still.")
     tune_steps: int = _option(3000, "steps of the joint fine-tuning on the losses of the condition.")
-    tighten_steps: int = _option(2000, "steps on counterexamples of the proof, where tolerated_error is positive.")
+    tighten_steps: int = _option(2000, "steps on counterexamples of the proof, where tolerated_error or grid is positive.")
     margin: float = _option(0.1, "margin m of the condition R3, B <= 0 implies B(d(z, pi(z))) + m <= 0.")
     band: float = _option(0.1, "barrier value up to which R3 is asked.")
     batch: int = _option(512, "latents per step.")

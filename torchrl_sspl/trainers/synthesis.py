@@ -539,9 +539,9 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
         ['gather', 'dynamics', 'teach', 'fit', 'steer', 'tune']
     """
     teach = [TeachPolicy] if config.teacher == "value" else []
-    tighten = [Tighten] if config.tolerated_error > 0 else []
+    tighten = [Settle if config.grid else Tighten] if config.tighten_steps and (config.grid or config.tolerated_error > 0) else []
     steady = [SteadyEncoder(0), KeepChanges(0)] if config.steady_steps else []
-    after = [Settle] if config.grid else [SteerPolicy, FineTune, *tighten]
+    after = tighten if config.grid else [SteerPolicy, FineTune, *tighten]
     kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, *after, *([check] if check else [])]
     return [*steady, *(kind(k) for k in range(config.rounds) for kind in kinds)]
 
