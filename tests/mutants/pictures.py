@@ -20,7 +20,7 @@ MUTANTS = [
     (MOMENTS, "(like.flatten(1) @ self.places.T + self.still).argmax(1)", "(like.flatten(1) @ self.places.T).argmax(1)", PLACED),
     (MOMENTS, "        super()._load_from_state_dict(*arguments)\n        self._look()", "        super()._load_from_state_dict(*arguments)", PLACED),
     (KNOWN, "torch.arange(len(part)).repeat(2)", "torch.arange(2 * len(part))", CHANGED),
-    (SELECT, "_CHANGED_SHARE = 2e-5", "_CHANGED_SHARE = 1e-3", SELECTED),
-    (SELECT, "changed = held_out.changed <= level", "changed = held_out.changed <= level - 0.1", SELECTED),
+    (SELECT, "int(changed.sum()), 0.0", "int(changed.sum()), 1e-3 * len(changed)", SELECTED),
+    (SELECT, "changed = held_out.changed <= level + s.guard", "changed = held_out.changed <= level", SELECTED),
     (SELECT, "changed = encode_states(agent, env, in_unsafe, augmentation=cameras)", "changed = encode_states(agent, env, in_unsafe)", SELECTED),
 ]

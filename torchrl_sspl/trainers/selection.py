@@ -24,7 +24,6 @@ _LOWEST_LEVEL = -0.2
 _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away from what the set tolerates
 _UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
 _STEP, _TRIED = 2, 6  # levels between two for which a proof is tried, and how many of these
-_CHANGED_SHARE = 2e-5  # of the changed pictures of U that may lie inside: noise has no bound
 _BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
 _Count = tuple[str, int, float]  # of what, how many, and how many there may be
 
@@ -60,12 +59,11 @@ class CheckRound(Phase):
 
     The environment knows its sets: fresh observations of S and U and fresh episodes start in them. Eight observations
     of U for every episode, 128,000 at most, all drawn uniformly: no state is searched for; and where the training changes
-    its pictures, as many more, changed as these are, of which two in 100,000 may lie inside. A set is left from its rim,
-    in the first steps, so many short episodes say more than few long ones. Where a proof is asked for, a level passes if the
-    weights say that its set tolerates an error (branch and bound), the checks are made with the memory held in the set,
-    and the proof applies to enough of the episodes. An observer that believes itself more than what it sees keeps a
-    constant innovation; a set is refused where the mean innovation of an episode is larger than single ones under random
-    actions ever are.
+    its pictures, as many more, changed as these are. A set is left from its rim, in the first steps, so many short episodes
+    say more than few long ones. Where a proof is asked for, a level passes if the weights say that its set tolerates an
+    error (branch and bound), the checks are made with the memory held in the set, and the proof applies to enough of the
+    episodes. An observer that believes itself more than what it sees keeps a constant innovation; a set is refused where
+    the mean innovation of an episode is larger than single ones under random actions ever are.
     Source: none; the paper stops at a total loss of zero.
     """
 
@@ -117,8 +115,8 @@ class CheckRound(Phase):
         inside, outside = held_out.unsafe <= level + s.guard, held_out.safe > level
         counts = [("unsafe inside", int(inside.sum()), 0.0), ("safe outside", int(outside.sum()), s.safe_share * len(outside))]
         if held_out.changed is not None:
-            changed = held_out.changed <= level
-            counts.append(("unsafe inside as changed", int(changed.sum()), _CHANGED_SHARE * len(changed)))
+            changed = held_out.changed <= level + s.guard
+            counts.append(("unsafe inside as changed", int(changed.sum()), 0.0))
         return counts
 
     @staticmethod
