@@ -92,7 +92,7 @@ def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkp
     assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
 
 
-@pytest.mark.parametrize("results", [3, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 4, 6, 8, 11, 16)]])
+@pytest.mark.parametrize("results", [3, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 4, 6, 8, 11, 16, 20)]])
 def test_what_a_phase_without_steps_had_found_is_not_found_again(tmp_path, uninterrupted, monkeypatch, results):
     """Transitions, latents, episodes and proofs: killed when one of them is written, a training goes on from there, bit for bit."""
     whole, expected = uninterrupted
@@ -121,6 +121,31 @@ def test_what_a_phase_without_steps_had_found_is_not_found_again(tmp_path, unint
     assert resumed.work.source.budget == whole.work.source.budget
     assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
     assert not (tmp_path / journal_module.FOLDER).exists()
+
+
+def test_targets_are_not_computed_again_in_the_middle_of_their_fit(tmp_path, uninterrupted, monkeypatch):
+    whole, expected = uninterrupted
+    monkeypatch.setattr(journal_module, "_SHORT", 0.0)
+    killed, computed, compute = experiment(tmp_path, EVERY_STEP), [], targets._targets
+    save = killed.trainer._save_trainer
+
+    def save_and_die() -> None:
+        save()
+        if killed.work.where.get("phase") == "fit" and killed.work.loop.step == 3:  # the barrier has moved
+            raise Killed
+
+    def counted(work, number):
+        computed.append((work.where["phase"], number))
+        return compute(work, number)
+
+    killed.trainer._save_trainer = save_and_die  # type: ignore[method-assign]
+    monkeypatch.setattr(targets, "_targets", counted)
+    with pytest.raises(Killed):
+        killed.train()
+    assert computed == [("fit", 0)]
+    assert_same(experiment(tmp_path, EVERY_STEP).train(), expected)
+    assert computed.count(("fit", 0)) == 1
+    assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
 
 
 @pytest.mark.parametrize("checkpoints", [3, 15])

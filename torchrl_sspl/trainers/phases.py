@@ -393,6 +393,7 @@ class Phases(TrainerHookBase):
     def __init__(self, phases: Sequence[Phase], work: Any, *, progress: bool = False) -> None:
         self.phases, self.work, self.progress = list(phases), work, progress
         self.done, self.resumed = 0, False
+        self.weights: list[str] = []  # digests of them, as the phase began
         self.trainer: Any = None
         self.bar: Any = None  # of the trainer, where it has one for both
 
@@ -447,8 +448,9 @@ class Phases(TrainerHookBase):
             work.logged_step = base + self.steps_done
             self._show(phase, rounds)
             if not work.skip:
-                weights = [weights_digest(net.state_dict()) for net in (work.encoder, work.networks)]
-                with journal(work.out_dir, f"{phase.name}-{phase.number}", *weights):
+                if work.loop.step == 0:  # what a phase computes first still counts when its steps have moved the weights
+                    self.weights = [weights_digest(net.state_dict()) for net in (work.encoder, work.networks)]
+                with journal(work.out_dir, f"{phase.name}-{phase.number}", *self.weights):
                     phase.run(work)
             work.loop.restart()
             self.done += 1
@@ -486,11 +488,12 @@ class Phases(TrainerHookBase):
 
     def state_dict(self) -> dict[str, Any]:
         """Which phases are done, and the workspace once the first has begun."""
-        return {"done": self.done, "begun": self.begun, "work": self.work.state_dict() if self.begun else None}
+        work = self.work.state_dict() if self.begun else None
+        return {"done": self.done, "begun": self.begun, "weights": self.weights, "work": work}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
-        self.done, self.resumed = int(state["done"]), bool(state["begun"])
+        self.done, self.resumed, self.weights = int(state["done"]), bool(state["begun"]), state.get("weights", [])
         if self.resumed:
             self.work.load_state_dict(state["work"])
 

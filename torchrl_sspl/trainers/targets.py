@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_sspl.direction import charted, lifted, within
+from torchrl_sspl.journal import journal, kept
 from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.phases import InnerLoop, Workspace, action_grid
@@ -122,44 +123,51 @@ def successors(work: Workspace, latent: Tensor, actions: Tensor) -> Tensor:
 def targets(work: Workspace, number: int) -> tuple[TensorDict, TensorDict]:
     """Latents with the targets of barrier and policy, and the latents on which the condition is asked; computed once a round."""
     if "targets" not in work.cache:
-        s, data = work.config, work.latents
-        g = torch.Generator().manual_seed(work.seed + 88_000 + number)
-        z, region = data["latent"], data["region"]
-        if work.seen_dim is not None:  # a label is about a picture, whatever the memory holds beside it
-            z, region = torch.cat([z, remembered(work, data["seen"], g)]), torch.cat([torch.zeros_like(region), region])
-        unsafe = region[:, 0] == UNSAFE
-        zc = z[~unsafe]
-        near, axes = observed_errors(work, zc, g, s.residual_spread)
-        stray = uniform(work, 60000, g)
-        tube, _ = off_manifold(work, z, 2 * s.tube_radius, 1000 + number)
-        rim, rows = off_manifold(work, zc, 1.2 * s.tube_radius, 2000 + number)
-        queries = torch.cat([z, data["next_latent"], tube, stray])
-        if s.grid:
-            target, member, best, weight = _grid_targets(work, z, unsafe, queries)
-        elif s.teacher == "value":
-            target, member, best, weight = _value_targets(work, z, region, queries, axes)
-        else:
-            target, member, best, weight = _clearance_targets(work, z, unsafe, queries, stray, axes, g)
-        rest = len(queries) - len(z)
-        table = TensorDict(
-            latent=queries,
-            barrier_target=target[:, None],
-            inside=member[:, None],
-            action_target=torch.cat([best, torch.zeros(rest, best.shape[1])]),
-            action_weight=torch.cat([weight, torch.zeros(rest)])[:, None],
-            region=torch.cat([region, torch.zeros(rest, 1, dtype=torch.int64)]),
-            batch_size=[len(queries)],
-        )
-        asked = TensorDict(
-            latent=torch.cat([zc, rim]), residual=torch.cat([near, near[rows]]), batch_size=[len(zc) + len(rim)]
-        )
-        work.cache["targets"] = table, asked
+        with journal(None, "targets", number):
+            found = kept(lambda: _targets(work, number))
+        said = found.pop("said")
+        work.kept_share = said["inside_of_allowed"]
+        work.log_once({"step": 0, **said})
+        work.cache["targets"] = tuple(TensorDict(v, batch_size=[len(v["latent"])]) for v in found.values())
     return work.cache["targets"]
+
+
+def _targets(work: Workspace, number: int) -> dict[str, dict[str, Any]]:
+    """Both, and what is worth a line in the log."""
+    s, data = work.config, work.latents
+    g = torch.Generator().manual_seed(work.seed + 88_000 + number)
+    z, region = data["latent"], data["region"]
+    if work.seen_dim is not None:  # a label is about a picture, whatever the memory holds beside it
+        z, region = torch.cat([z, remembered(work, data["seen"], g)]), torch.cat([torch.zeros_like(region), region])
+    unsafe = region[:, 0] == UNSAFE
+    zc = z[~unsafe]
+    near, axes = observed_errors(work, zc, g, s.residual_spread)
+    stray = uniform(work, 60000, g)
+    tube, _ = off_manifold(work, z, 2 * s.tube_radius, 1000 + number)
+    rim, rows = off_manifold(work, zc, 1.2 * s.tube_radius, 2000 + number)
+    queries = torch.cat([z, data["next_latent"], tube, stray])
+    if s.grid:
+        target, member, best, weight, said = _grid_targets(work, z, unsafe, queries)
+    elif s.teacher == "value":
+        target, member, best, weight, said = _value_targets(work, z, region, queries, axes)
+    else:
+        target, member, best, weight, said = _clearance_targets(work, z, unsafe, queries, stray, axes, g)
+    rest = len(queries) - len(z)
+    table = {
+        "latent": queries,
+        "barrier_target": target[:, None],
+        "inside": member[:, None],
+        "action_target": torch.cat([best, torch.zeros(rest, best.shape[1])]),
+        "action_weight": torch.cat([weight, torch.zeros(rest)])[:, None],
+        "region": torch.cat([region, torch.zeros(rest, 1, dtype=torch.int64)]),
+    }
+    asked = {"latent": torch.cat([zc, rim]), "residual": torch.cat([near, near[rows]])}
+    return {"table": table, "asked": asked, "said": said}
 
 
 def _clearance_targets(
     work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor, stray: Tensor, errors: Tensor, generator: torch.Generator
-) -> tuple[Tensor, ...]:
+) -> tuple[Any, ...]:
     """Signed distance to the robust invariant set; actions that keep the largest clearance, or lead back soonest."""
     s = work.config
     zc, actions = z[~unsafe], action_grid(work.action_scale, s.actions)
@@ -182,13 +190,12 @@ def _clearance_targets(
     best[outer] = torch.softmax(-times / 0.1, 1) @ actions
     weight = torch.ones(len(z))
     weight[outer] = (times.min(1).values < 100).float()
-    work.kept_share = float(found.inside.float().mean())
-    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
-    return target, member, best, weight
+    said = {"inside_of_allowed": float(found.inside.float().mean()), "sweeps": found.iterations}
+    return target, member, best, weight, said
 
 
 @torch.no_grad()
-def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -> tuple[Tensor, ...]:
+def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -> tuple[Any, ...]:
     """Signed distance to what some action of the table keeps, whatever error is added, on a grid over the latent domain; and the
     taught policy."""
     s, teacher, turns = work.config, work.teacher_policy or work.policy, work.direction
@@ -212,16 +219,23 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
         margin = lambda x: nearest_distance(x[:, :seen], looks_unsafe) - 0.1 / (s.grid - 1)  # noqa: E731
     step = partial(_charted_step, work)
     system: dict[str, Any] = {"margin": lambda x: margin(lifted(x, turns)) - room, "actions": actions, "errors": errors}
-    found = viability_kernel(step, low=low, high=[-v for v in low], resolution=sizes, period=period, exit_is_safe=False, **system)
+    box: dict[str, Any] = {"low": low, "high": [-v for v in low], "resolution": sizes, "period": period}
+
+    def kernel() -> dict[str, Any]:
+        computed = viability_kernel(step, exit_is_safe=False, **box, **system)
+        return {k: v for k, v in vars(computed).items() if k != "grid"}
+
+    found = ViabilityKernel(grid=Grid(**box), **kept(kernel))
     if not bool((found.value > 0.0).any()):  # nothing can be kept under these errors; the checks will say what the rest is worth
         found = replace(found, value=found.margin)
     sizes = [2 * n - (not p) for n, p in zip(sizes, period, strict=True)]
     fine = Grid(low, [-v for v in low], sizes[: len(sizes) - hidden] + [_MEMORY] * hidden, period)
-    distance = _signed_distance(fine, _inside(found, fine, step, **system), charted(queries, turns))
+    inside = kept(lambda: _inside(found, fine, step, **system))
+    distance = _signed_distance(fine, inside.numpy(), charted(queries, turns))
     target = (_SLOPE * work.lipschitz_bound * distance).clamp(-_DEPTH, _DEPTH)
-    work.kept_share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
-    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "sweeps": found.iterations})
-    return target, target <= 0.0, teacher(z), torch.ones(len(z))
+    share = float((found.value > 0.0).float().sum() / (found.margin > 0.0).float().sum().clamp_min(1.0))
+    said = {"inside_of_allowed": share, "sweeps": found.iterations}
+    return target, target <= 0.0, teacher(z), torch.ones(len(z)), said
 
 
 def _charted_step(work: Workspace, chart: Tensor, action: Tensor) -> Tensor:
@@ -229,7 +243,7 @@ def _charted_step(work: Workspace, chart: Tensor, action: Tensor) -> Tensor:
     return charted(work.dynamics(lifted(chart, turns), action), turns)
 
 
-def _inside(found: ViabilityKernel, fine: Grid, step: Callable[[Tensor, Tensor], Tensor], **system: Any) -> np.ndarray:
+def _inside(found: ViabilityKernel, fine: Grid, step: Callable[[Tensor, Tensor], Tensor], **system: Any) -> Tensor:
     """Which nodes of a finer grid belong to a set on a grid: where its values are not cut, by one step from them.
 
     Between left and right of an obstacle the values have a valley, which interpolation fills up.
@@ -238,7 +252,7 @@ def _inside(found: ViabilityKernel, fine: Grid, step: Callable[[Tensor, Tensor],
     value = torch.cat([found.interpolate(part) for part in nodes.split(_PART)])
     for rows in (value.abs() < 0.99 * cut).nonzero()[:, 0].split(_PART):
         value[rows] = one_step_value(found, nodes[rows], step, **system)
-    return (value > 0.0).reshape(fine.shape).numpy()
+    return (value > 0.0).reshape(fine.shape)
 
 
 def _signed_distance(fine: Grid, inside: np.ndarray, queries: Tensor) -> Tensor:
@@ -288,7 +302,7 @@ def _unsafe_margin(work: Workspace, seen: Tensor, unsafe: Tensor) -> Callable[[T
 
 
 @torch.no_grad()
-def _value_targets(work: Workspace, z: Tensor, region: Tensor, queries: Tensor, errors: Tensor) -> tuple[Tensor, ...]:
+def _value_targets(work: Workspace, z: Tensor, region: Tensor, queries: Tensor, errors: Tensor) -> tuple[Any, ...]:
     """Minus the margin that the taught policy keeps, or the best of the actions to choose from; and the taught policy itself."""
     s, teacher = work.config, work.teacher_policy or work.policy
     unsafe, safe = region[:, 0] == UNSAFE, region[:, 0] == SAFE
@@ -306,9 +320,8 @@ def _value_targets(work: Workspace, z: Tensor, region: Tensor, queries: Tensor, 
         if int((value[safe] > 0).sum()) >= _KEPT_OF_SAFE * int(safe.sum()):
             break
     target = value_targets(queries, z, value, tube_radius=s.tube_radius, lipschitz_bound=work.lipschitz_bound)
-    work.kept_share = float((value[~unsafe] > 0).float().mean())
-    work.log_once({"step": 0, "inside_of_allowed": work.kept_share, "spread": share * s.residual_spread})
-    return target, target <= 0, action, torch.ones(len(z))
+    said = {"inside_of_allowed": float((value[~unsafe] > 0).float().mean()), "spread": share * s.residual_spread}
+    return target, target <= 0, action, torch.ones(len(z)), said
 
 
 __all__ = ["observed_errors", "off_manifold", "remembered", "successors", "targets", "uniform"]
