@@ -27,7 +27,7 @@ from torchrl_sspl.runtime.filter import LEVEL, UNPROVED_MARGIN
 from torchrl_sspl.runtime.monitor import starts
 from torchrl_sspl.sets import UNSAFE
 
-STEPS, SEED = 200, 20261122
+STEPS, SEED, AT_ONCE = 200, 20261122, 250
 TURNS, LOOKAHEAD = 32, 60  # longest turn that the adversarial driver of a car thinks of, and how far it looks ahead, in steps
 
 SIDES = (-1.0, 0.0, 1.0)
@@ -125,13 +125,18 @@ def on_known_dynamics(agent: Any, env: Any, draw: Any, start: Tensor, wants: Any
         made.append(shield(latent, action))
         return made[-1].action
 
-    acts = AgentController(agent, None if wants is None else Driver(wants, env), None if shield is None else change)
-    run = simulate(acts, env, start=start, horizon=STEPS, draw=draw, label="episodes" if sys.stderr.isatty() else None)
-    if not made:
-        return run, "- | -"
-    there = run.alive[1 : len(made) + 1]  # whoever left is asked for nothing
-    changed, moved = (torch.stack([getattr(m, k) for m in made])[: len(there)][there].float().mean() for k in ("intervened", "deviation"))
-    return run, f"{100 * float(changed):.3g} % | {float(moved):.2g}"
+    runs, steps, changed, moved = list[Episodes](), 0, 0.0, 0.0
+    # An agent by itself acts on few episodes at once; whoever draws actions for all of them needs all of them.
+    for part in start.split(AT_ONCE if wants is None else len(start)):
+        made.clear()
+        acts = AgentController(agent, None if wants is None else Driver(wants, env), None if shield is None else change)
+        runs.append(simulate(acts, env, start=part, horizon=STEPS, draw=draw, label="episodes" if sys.stderr.isatty() else None))
+        there = runs[-1].alive[1 : len(made) + 1]  # whoever left is asked for nothing
+        if made:
+            intervened, deviation = (torch.stack([getattr(m, k) for m in made])[: len(there)][there] for k in ("intervened", "deviation"))
+            steps, changed, moved = steps + len(deviation), changed + float(intervened.sum()), moved + float(deviation.sum())
+    told = f"{100 * changed / steps:.3g} % | {moved / steps:.2g}" if steps else "- | -"
+    return runs[0].joined(*runs[1:]), told
 
 
 def in_physics(agent: Any, env: Any, start: Tensor, wants: Any, options: dict[str, Any] | None) -> tuple[Episodes, str]:

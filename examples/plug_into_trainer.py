@@ -9,7 +9,7 @@ from torchrl.trainers import LRSchedulerHook, ReplayBufferTrainer, Trainer
 
 from torchrl_sspl import Agent, evaluate
 from torchrl_sspl.configs import compose
-from torchrl_sspl.data import RandomActions, TransitionStore
+from torchrl_sspl.data import Augmentation, RandomActions, TransitionStore
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.evaluation.certify import premise
 from torchrl_sspl.lipschitz import SandwichBarrier
@@ -42,7 +42,7 @@ def main(*overrides: str, batches: int = 19, updates: int = 400, loop: bool = Fa
     acting = RandomActions(env, seed) if phases else make_rollout_policy(salad, policy)
     collector = Collector(env, acting, auto_register_policy_transforms=False, max_frames_per_traj=4, **frames)
     taken = {"starts": config.collector.starts, "steps": config.synthesis.episode_steps, "seed": seed}
-    source = Source(make_env, salad.encoder, store=store, **taken)
+    source = Source(make_env, salad.encoder, store=store, changes=Augmentation(**vars(config.augmentation), seed=seed), **taken)
     work = Workspace(*salad, policy, config=config.synthesis, source=source, seed=seed)
     rounds = Phases(synthesis_phases(config.synthesis, check=CheckRound) if phases else [], work, progress=True)
 

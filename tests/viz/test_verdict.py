@@ -33,7 +33,7 @@ def test_the_shipped_pendulum_is_safe_as_far_as_its_certificate_reaches():
     assert screen.kind == "good"
     assert screen.headline == (
         "Safe as far as this reaches: in the learned dynamics the policy provably never leaves the safe set {B <= 0}; none of 3,000 "
-        "fresh episodes left it or entered the unsafe set U (at most 0.123 %); the proof covers at least 99.1 % of them."
+        "fresh episodes left it or entered the unsafe set U (at most 0.123 %); the proof covers at least 99 % of them."
     )
     assert "Not certified: the paper's own conditions" in screen.more
     assert "this run neither trained nor proved anything" in screen.more

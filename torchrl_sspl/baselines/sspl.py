@@ -24,6 +24,11 @@ from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.modules.agent import Agent, agent_directory, load
 from torchrl_sspl.runtime.filter import UNPROVED_MARGIN, Shield
 
+_PLAIN = [
+    "augmentation.share=0.0", "synthesis.steady_steps=0", "synthesis.dynamics_steps=1500", "synthesis.unsafe_margin=0.05",
+    "synthesis.guard=0.005",
+]  # fmt: skip
+
 
 def settings(system: str, budget: Budget) -> list[str]:
     """``key=value`` of a training with the transitions of a budget: the recommended settings of a system, with as many steps.
@@ -49,6 +54,8 @@ def settings(system: str, budget: Budget) -> list[str]:
         f"synthesis.transitions={frames}", "synthesis.rounds=1", "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
         # A memory, and what is proved of it, are learnt from rollouts.
         "synthesis.gain=1.0", "synthesis.tolerated_error=0.0", "synthesis.cover_share=0.0",
+        # The score's pictures have no noise to be steady under, and an error of one step adds up in a memory alone.
+        *(_PLAIN if usual.synthesis.steady_steps else []),
     ]  # fmt: skip
 
 
