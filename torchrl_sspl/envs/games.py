@@ -8,6 +8,7 @@ import pickle
 import signal
 import sys
 import time
+import traceback
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -159,11 +160,14 @@ class SpreadGames:
         sys.stdout.flush()  # or a child prints it once more
         for worker in range(workers):
             here, there = Pipe()
+            # Signals are blocked in the child for ever, and in the parent for as long as a child could take them for its own.
+            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
             with warnings.catch_warnings():  # of threads, none of which a child needs
                 warnings.simplefilter("ignore", DeprecationWarning)
                 pid = os.fork()
             if pid == 0:
                 _serve(there, build, [k for k in range(count) if self._owner[k] == worker])
+            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
             there.close()
             self._pipes.append(here)
             self.processes.append(pid)
@@ -226,8 +230,6 @@ def _serve(pipe: Connection, build: Callable[[], Game], numbers: Sequence[int]) 
     """What a child does until it is told to end, or its parent has ended. Never returns."""
     try:
         gc.freeze()  # what belongs to the parent is the parent's to close
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)
         signal.set_wakeup_fd(-1)
         os.closerange(3, pipe.fileno())
         os.closerange(pipe.fileno() + 1, os.sysconf("SC_OPEN_MAX"))
@@ -246,8 +248,11 @@ def _serve(pipe: Connection, build: Callable[[], Game], numbers: Sequence[int]) 
             game.close()
     except (EOFError, OSError):
         pass  # the parent has ended
+    except BaseException:
+        traceback.print_exc()
     finally:
-        sys.stdout.flush()
+        with suppress(BaseException):  # whatever happens, it must not go on as its parent
+            sys.stdout.flush()
         os._exit(0)
 
 
