@@ -276,6 +276,16 @@ def test_processes_end_with_the_environment(end):
 
 
 @spread
+def test_signals_are_for_the_parent():
+    env = slider(2, workers=2)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        for pid in env._games.processes:
+            os.kill(pid, number)
+    assert env.reset()["state"].shape == (2, 1)
+    env.close()
+
+
+@spread
 def test_processes_end_with_their_parent():
     read, write = os.pipe()
     parent = os.fork()
