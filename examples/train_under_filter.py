@@ -44,6 +44,7 @@ class Task(Transform):
     envs: ClassVar[int]  # side by side
     longest: ClassVar[int]  # episode, in steps
     most: ClassVar[str]  # of the return
+    level: ClassVar[float]  # of the filter
 
     def env(self, seed: int) -> sspl.envs.SafetyEnv:
         """Systems side by side, which start where the agent's set is."""
@@ -78,6 +79,7 @@ class HoldAngle(Task):
     """46 degrees, which is away from where the agent would go; U are angles beyond 90 degrees and speeds beyond 1.5 rad/s."""
 
     agent, envs, longest, most, goal = "pendulum", 20, 100, "at most 100", 0.8
+    level = -0.08  # at rest B is -.11 there
 
     def env(self, seed: int) -> sspl.envs.SafetyEnv:
         env = sspl.envs.PixelPendulumEnv(batch_size=[self.envs], seed=seed)
@@ -100,6 +102,7 @@ class ReachGoal(Task):
     """From the left of the obstacle to its right, on a car that turns as late as the walking robot does."""
 
     agent, envs, longest, most, goal, near = "quadruped", 40, 70, "about 5 at best", (1.5, 0.0), 0.4
+    level = -0.12
 
     def env(self, seed: int) -> sspl.envs.SafetyEnv:
         start = sspl.sets.Box([-1.9, -0.7, -0.5, -2.0], [-1.6, 0.7, 0.5, 2.0])
@@ -136,7 +139,7 @@ def collect(task: Task, learner: TensorDictModuleBase, seed: int, *, filtered: b
     """Episodes under a learner: PPO learns from what it wanted; what is done is what the filter makes of it."""
     env = task.env(seed)
     if filtered:
-        protect = sspl.SafetyFilter(sspl.load(task.agent))
+        protect = sspl.SafetyFilter(sspl.load(task.agent), level=task.level)
         looks, last = protect.make_tensordict_primer(), [protect]  # the filter has a memory
     else:  # nobody looks, nothing is drawn
         env.draw = lambda state: torch.zeros(len(state), 3, env.image_size, env.image_size, dtype=torch.uint8)

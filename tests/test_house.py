@@ -82,7 +82,7 @@ ONE = {
             "evaluation/simulation.py": "the simulator",
             "evaluation/blocks.py": "one step with the action zero tells two systems apart",
             "evaluation/known.py": "one step, whose error in the latent is measured",
-            "envs/gymnasium.py": "an environment around another",
+            "envs/games.py": "an environment around another",
             "runtime/wrapper.py": "an environment around another",
             "experiments/film.py": "a world around another",
             "baselines/ceilings.py": "predictions of filters that know the dynamics",

@@ -325,15 +325,16 @@ class Short(Gym):
         return observation, reward, False, self.t >= self.steps, info
 
 
-def vectorised(lengths: tuple[int, ...], mode: AutoresetMode) -> SafetyVectorWrapper:
-    return SafetyVectorWrapper(SyncVectorEnv([partial(Short, k) for k in lengths], autoreset_mode=mode), load("pendulum"))
+def vectorised(lengths: tuple[int, ...], mode: AutoresetMode, **options: Any) -> SafetyVectorWrapper:
+    return SafetyVectorWrapper(SyncVectorEnv([partial(Short, k) for k in lengths], autoreset_mode=mode), load("pendulum"), **options)
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_rows_of_a_vectorised_environment_are_protected_as_single_ones(mode):
-    """Row by row what the wrapper of single environments does, resets included."""
-    lengths, pushes = (7, 100), np.full((2, 1), 10.0, np.float32)
-    envs, singles = vectorised(lengths, mode), [SafetyWrapper(Short(k), load("pendulum")) for k in lengths]
+    """Row by row what the wrapper of single environments does, resets included; at a level at which no two actions are nearly as good,
+    of which a batch, that rounds otherwise, may choose another."""
+    lengths, pushes, level = (7, 100), np.full((2, 1), 10.0, np.float32), {"level": -0.05}
+    envs, singles = vectorised(lengths, mode, **level), [SafetyWrapper(Short(k), load("pendulum"), **level) for k in lengths]
     _, info = envs.reset(seed=3)
     told = [one.reset(seed=3 + k)[1]["safety"] for k, one in enumerate(singles)]
     ended, steps = [False, False], 0

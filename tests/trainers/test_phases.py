@@ -199,12 +199,12 @@ def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_pat
     work.originals["dynamics"], work.teacher_policy, work.seen_dim = Line(), lambda z: torch.zeros(len(z), 1), None
     z = torch.linspace(-1, 1, 401)[:, None]
     queries = torch.tensor([[0.0], [0.09], [0.13], [0.5], [-0.5]])
-    target, member, action, _ = _grid_targets(work, z, z[:, 0].abs() < 0.1, queries)
+    target, member, action, _, said = _grid_targets(work, z, z[:, 0].abs() < 0.1, queries)
     assert member.tolist() == [False, False, True, True, True]
     assert target[0] == pytest.approx(0.9 * work.lipschitz_bound * 0.1, abs=0.02)  # distance to what is kept
     assert target[3] == target[4] == -0.25
     assert action.shape == (401, 1)
-    assert 0.9 < work.kept_share <= 1.0
+    assert 0.9 < said["inside_of_allowed"] <= 1.0
     assert asked["errors"].flatten().tolist() == pytest.approx([-0.08, 0.0, 0.08])  # four times what is to be tolerated
     assert asked["actions"].tolist() == [[-1.0], [1.0]]
 

@@ -344,10 +344,10 @@ class Config:
                 f"expected collector.init_random_frames of at most trainer.total_frames={self.trainer.total_frames}, received "
                 f"{c.init_random_frames}: nothing would be learnt"
             )
-        if self.synthesis.steady_steps > 0 and not (self.augmentation.share > 0 and self.synthesis.enabled):
+        if self.synthesis.enabled and self.synthesis.steady_steps > 0 and not self.augmentation.share > 0:
             raise ConfigError(
-                f"expected augmentation.share > 0 and synthesis.enabled=true with synthesis.steady_steps={self.synthesis.steady_steps}, "
-                f"received {self.augmentation.share} and {self.synthesis.enabled}: there is nothing to be steady under"
+                f"expected augmentation.share > 0 with synthesis.steady_steps={self.synthesis.steady_steps}, received {self.augmentation.share}: "
+                "there is nothing to be steady under; synthesis.steady_steps=0 leaves the encoder as it is"
             )
         if self.labels.choose and not self.synthesis.enabled:
             raise ConfigError(f"expected labels.choose=0 with synthesis.enabled=false, received {self.labels.choose}: pictures are chosen on its latents")
