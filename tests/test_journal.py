@@ -15,7 +15,7 @@ from torchrl_sspl.evaluation.controllers import AgentController, RandomControlle
 from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.interrupts import Interrupted
-from torchrl_sspl.journal import FOLDER, Entry, journal
+from torchrl_sspl.journal import FOLDER, Entry, journal, kept_parts
 from torchrl_sspl.lipschitz import SandwichBarrier
 from torchrl_sspl.modules import LatentDynamics, Policy
 from torchrl_sspl.modules.agent import load
@@ -226,6 +226,30 @@ def test_episodes_and_latents_are_not_made_again(tmp_path, monkeypatch):
     for name in ("states", "barrier", "latent", "actions", "alive"):
         assert torch.equal(getattr(expected[1], name), getattr(found[1], name)), name
     assert expected[1].events.keys() == found[1].events.keys()
+
+
+def test_no_part_is_computed_twice_and_parts_of_something_else_are(tmp_path):
+    computed: list[int] = []
+
+    def squared(part):
+        if len(computed) == 3:
+            raise Killed
+        computed.append(part)
+        return part * part
+
+    with journal_of_a_killed_run(tmp_path, "run"):
+        kept_parts(squared, range(5), "squares")
+    assert computed == [0, 1, 2]
+    computed.clear()
+    with journal_of_a_killed_run(tmp_path, "run"):
+        assert kept_parts(squared, range(5), "squares") == [0, 1, 4, 9, 16]
+    assert computed == [3, 4]
+    computed.clear()
+    with journal_of_a_killed_run(tmp_path, "run"):
+        kept_parts(squared, range(5), "squares of others")
+    assert computed == [0, 1, 2]
+    computed.clear()
+    assert kept_parts(squared, [], "squares") == []
 
 
 def test_blocks_of_a_certificate_are_not_drawn_again(tmp_path, monkeypatch):

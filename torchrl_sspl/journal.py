@@ -7,10 +7,11 @@ import io
 import pickle
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -140,6 +141,30 @@ def kept(compute: Callable[[], Any], *about: Any) -> Any:
     return found
 
 
+def kept_parts(compute: Callable[[Any], Any], parts: Iterable[Any], *about: Any) -> list[Any]:
+    """What is computed of parts, one after the other; as many as the open journal has from there.
+
+    Args:
+        compute: of a part, as in :func:`kept`.
+        parts: in an order that stays the same.
+        about: as in :class:`Entry`.
+
+    Source: none.
+
+    Example:
+        >>> kept_parts(lambda k: 2 * k, range(3), "doubled")
+        [0, 2, 4]
+    """
+    entry = Entry(*about)
+    found = entry.saved() or []
+    for part in islice(parts, len(found), None):
+        found.append(compute(part))
+        if entry.due:
+            entry.save(found)
+    entry.save(found, complete=True)
+    return found
+
+
 def _digest(about: Any) -> str:
     """Digits that are the same for the same values."""
     found = hashlib.sha256()
@@ -159,4 +184,4 @@ def _digest(about: Any) -> str:
     return found.hexdigest()[:16]
 
 
-__all__ = ["FOLDER", "Entry", "journal", "kept"]
+__all__ = ["FOLDER", "Entry", "journal", "kept", "kept_parts"]

@@ -331,8 +331,8 @@ def vectorised(lengths: tuple[int, ...], mode: AutoresetMode, **options: Any) ->
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
 def test_rows_of_a_vectorised_environment_are_protected_as_single_ones(mode):
-    """Row by row what the wrapper of single environments does, resets included; at a level at which no two actions are nearly as good,
-    of which a batch, that rounds otherwise, may choose another."""
+    """Row by row what the wrapper of single environments does, resets included; at a level at which the nearest action does not hang on
+    the last digits of the barrier, which a batch rounds otherwise."""
     lengths, pushes, level = (7, 100), np.full((2, 1), 10.0, np.float32), {"level": -0.05}
     envs, singles = vectorised(lengths, mode, **level), [SafetyWrapper(Short(k), load("pendulum"), **level) for k in lengths]
     _, info = envs.reset(seed=3)

@@ -165,6 +165,13 @@ def test_where_training_changes_its_pictures_those_of_u_are_held_out_changed_too
     assert torch.equal(found.changed, agent.least_barrier(other.changed))
 
 
+def test_changes_that_change_nothing_are_not_looked_at():
+    source = workspace().source
+    for share, looked_at in ((0.0, False), (0.1, True)):
+        found = Source(source.make_env, source.encoder, seed=0, changes=Augmentation(share=share))
+        assert (found.changes is not None) == looked_at
+
+
 def test_no_changed_picture_of_u_lies_inside_or_less_than_the_guard_above():
     for one, reason in ((-0.1, "unsafe inside as changed 1"), (0.02, "unsafe inside as changed 1"), (0.021, "")):
         found = check(held_out(changed=values(100_000, usual=0.5, one=one)))

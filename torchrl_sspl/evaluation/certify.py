@@ -55,7 +55,7 @@ from torchrl_sspl.evaluation.blocks import (
     summarise,
     summary_changes,
 )
-from torchrl_sspl.journal import Entry, journal
+from torchrl_sspl.journal import journal, kept
 from torchrl_sspl.modules.agent import Agent, agent_directory
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 
@@ -331,14 +331,13 @@ def _measured(certificate: Certificate, agent: Agent, source: Any, progress: boo
 
 def _kept_block(source: Any, index: int, about: Any) -> Block:
     """A block of episodes, from the open journal where it has it: each is drawn with a seed of its own."""
-    with journal(None, f"block{index}", about):
-        entry = Entry()
-        kept = entry.saved()
-        if kept is not None:
-            return Block(**kept | {name: Counts(**kept[name]) for name in ("counts", "least")})
+    def plain() -> dict[str, Any]:
         block: Block = source(index)
-        entry.save(vars(block) | {name: vars(getattr(block, name)) for name in ("counts", "least")}, complete=True)
-        return block
+        return vars(block) | {name: vars(getattr(block, name)) for name in ("counts", "least")}
+
+    with journal(None, f"block{index}", about):
+        found = kept(plain)
+    return Block(**found | {name: Counts(**found[name]) for name in ("counts", "least")})
 
 
 def _tolerated(certificate: Certificate, agent: Agent) -> float | None:

@@ -18,7 +18,7 @@ from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, Camera, Controller, as_controller
 from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, quantiles, share
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
-from torchrl_sspl.journal import Entry
+from torchrl_sspl.journal import kept_parts
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules.agent import Agent, on_host
 from torchrl_sspl.sets import Region
@@ -39,18 +39,16 @@ def encode_states(
         augmentation: changes these frames, both of a state as seen by one camera.
     """
     agent, draw = on_host(agent), draw or env.draw
-    entry = Entry("latents", state)
-    latents = entry.saved() or [torch.zeros(0, agent.latent_dim)]
-    parts = list(enumerate(state.split(CHUNK) if len(state) else ()))
-    for position, part in parts[len(latents) - 1 :]:
+
+    def latent(numbered: tuple[int, Tensor]) -> Tensor:
+        position, part = numbered
         frames = torch.cat([draw(env.previous_state(part)), draw(part)])
         if augmentation is not None:
             frames = augmentation(frames, torch.arange(len(part)).repeat(2), position)
-        latents.append(agent.encode(torch.cat(frames.chunk(2), dim=-3)))
-        if entry.due:
-            entry.save(latents)
-    entry.save(latents, complete=True)
-    return torch.cat(latents)
+        return agent.encode(torch.cat(frames.chunk(2), dim=-3))
+
+    parts = enumerate(state.split(CHUNK) if len(state) else ())
+    return torch.cat([torch.zeros(0, agent.latent_dim), *kept_parts(latent, parts, "latents of states", state)])
 
 
 def barrier_of(acts: Any, env: SafetyEnv, state: Tensor, *, draw: Draw | None = None) -> Tensor | None:

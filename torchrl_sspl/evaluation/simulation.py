@@ -23,7 +23,7 @@ from torchrl_sspl.evaluation.controllers import (
     as_controller,
 )
 from torchrl_sspl.evaluation.measurements import Draw
-from torchrl_sspl.journal import Entry
+from torchrl_sspl.journal import kept
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 Watch = Callable[[Decision, Tensor], None]
@@ -238,13 +238,7 @@ def _kept(acts: Controller, watch: Watch | None, simulated: Callable[[], Episode
     """Episodes, from the open journal where it has them."""
     if not _alone(acts, watch):
         return simulated()
-    entry = Entry("episodes", *about)
-    kept = entry.saved()
-    if kept is not None:
-        return Episodes(**kept)
-    found = simulated()
-    entry.save(vars(found), complete=True)
-    return found
+    return Episodes(**kept(lambda: vars(simulated()), "episodes", *about))
 
 
 def _side_by_side(

@@ -86,7 +86,8 @@ class Source:
     ) -> None:
         self.make_env, self.encoder, self.store, self.labels = make_env, getattr(encoder, "module", encoder), store, labels
         self.starts, self.steps, self.envs, self.seed, self.augmentation = list(starts), steps, envs, seed, augmentation
-        self.changes = augmentation if changes is None else changes
+        changes = augmentation if changes is None else changes
+        self.changes = changes if changes is not None and changes.share > 0.0 else None  # what changes nothing is not looked at twice
         self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
 
     @cached_property

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.journal import Entry
+from torchrl_sspl.journal import kept_parts
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.trainers.phases import Phase, Workspace
 
@@ -89,18 +89,16 @@ def _changed(work: Workspace, frames: Tensor, seed: int) -> Tensor:
 @torch.no_grad()
 def _encoded(work: Workspace, rows: Tensor, seed: int | None = None) -> Tensor:
     """Latents ``(k, p)`` of stored pictures, on the CPU; with a seed as cameras with changes capture them."""
-    device, entry = next(work.encoder.parameters()).device, Entry("pictures", seed, rows)
-    found = entry.saved() or []
-    parts = list(enumerate(rows.split(_ENCODED)))
-    for k, part in parts[len(found) :]:
+    device = next(work.encoder.parameters()).device
+
+    def latent(numbered: tuple[int, Tensor]) -> Tensor:
+        k, part = numbered
         frames = work.source.store.get(part)["frames"][:, :2]
         if seed is not None:
             frames = _changed(work, frames, seed + k)
-        found.append(work.encoder(frames.flatten(1, 2).to(device)).cpu())
-        if entry.due:
-            entry.save(found)
-    entry.save(found, complete=True)
-    return torch.cat(found)
+        return work.encoder(frames.flatten(1, 2).to(device)).cpu()
+
+    return torch.cat(kept_parts(latent, enumerate(rows.split(_ENCODED)), "pictures", seed, rows))
 
 
 __all__ = ["KeepChanges", "SteadyEncoder"]
