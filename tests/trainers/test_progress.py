@@ -81,7 +81,7 @@ def test_what_is_not_shown_asks_for_nothing():
     assert bar.n == 7
 
 
-def test_every_round_ends_with_a_sentence(capsys):
+def test_every_round_ends_with_a_sentence_and_collecting_is_counted(capsys):
     found = Check(0, 0.0, 0, 0, 2, 0, 0.98, 0.62, True, "")
 
     class Checked(Phase):
@@ -89,14 +89,16 @@ def test_every_round_ends_with_a_sentence(capsys):
 
         def run(self, work):
             work.checks.append(found)
+            work.source.tell(28_672)
 
     loop = SimpleNamespace(step=0, restart=lambda: None, loss=None)
     work = SimpleNamespace(
         checks=[], config=SimpleNamespace(check_episodes=4000), loop=loop, skip=False, begin=lambda: None, finish=lambda: None,
-        out_dir=None, encoder=nn.Identity(), networks=nn.ModuleDict(),
+        out_dir=None, encoder=nn.Identity(), networks=nn.ModuleDict(), source=SimpleNamespace(),
     )
     Phases([Checked(0)], work, progress=True).run()
     said = "".join(capsys.readouterr())
+    assert "28,672 transitions seen" in said
     assert "round 1: the safe set covers 62 % of the space outside U; of up to 4,000 held-out episodes 2 left it, 0 entered U" in said
     refused = Check(1, 0.0, 3, 0, 0, 0, 0.0, 0.4, False, "unsafe inside 3")
     assert round_line(refused, 10).endswith("not kept, because of: unsafe inside 3")

@@ -102,9 +102,12 @@ def test_the_same_seed_gives_the_same_transitions_and_another_index_others(encod
     assert not same(build(encoder).random(24, 1), build(encoder, seed=4).random(24, 1))
 
 
-def test_pictures_are_held_in_chunks_of_their_own_seeds(encoder, monkeypatch):
+def test_pictures_are_held_in_chunks_of_their_own_seeds_and_counted_as_they_come(encoder, monkeypatch):
     monkeypatch.setattr(source, "_CHUNK", 16)
-    found = build(encoder).random(40, 0)
+    collecting, told = build(encoder), []
+    collecting.tell = told.append
+    found = collecting.random(40, 0)
+    assert told == [16, 32, 40]
     assert len(found["seen"]) == len(found["region"]) == 40
     assert len(found["action"].unique()) == 40
 

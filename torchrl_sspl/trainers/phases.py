@@ -440,6 +440,8 @@ class Phases(TrainerHookBase):
         own_bar = self.bar is None
         if own_bar:
             self.bar = Progress(self.steps, self.steps_done, shown=self.progress, out_dir=work.out_dir)
+        if work.source is not None:
+            work.source.tell = self.bar.saw
         before = self.bar.n - self.steps_done
         rounds = 1 + max(phase.number for phase in self.phases)
         while not self.finished:

@@ -59,13 +59,14 @@ class Progress:
         self.shown, self.n, self._note = shown, done, "resumed" if resumed else ""
         self._total, self._words, self._state = total, "", None if out_dir is None else out_dir / PROGRESS_FILE
         self.kept: float | None = None  # share of the space outside U in the set, so far
+        self._seen: int | None = None  # transitions, where a phase looks for more
         self._began, self._first, self._size, self._left, self._looked = time.monotonic(), done, 0, 0, 0.0
         self.begin("starting", 0)
 
     def begin(self, words: str, size: int, *, taken: int = 0, left: int = 0) -> None:
         """A phase of so many steps, of which so many were taken before; so many further phases are ``left``."""
         self._began, self._first, self._size, self._left = time.monotonic(), self.n, size - taken, left
-        self._words = words
+        self._words, self._seen = words, None
         self._bar.set_description_str(words, refresh=False)
         self.show()
 
@@ -77,11 +78,18 @@ class Progress:
             self._looked = time.monotonic()
             self.show(loss() if self.shown else None)
 
+    def saw(self, transitions: int) -> None:
+        """So many so far: a phase that takes no steps takes minutes for them."""
+        self._seen = transitions
+        self.show()
+
     def show(self, loss: float | None = None) -> None:
         """Loss, volume and time left."""
         parts = [self._note] if self._note else []
         if loss is not None:
             parts.append(f"loss {loss:.3g}")
+        if self._seen is not None:
+            parts.append(f"{self._seen:,} transitions seen")
         if self.kept is not None:
             parts.append(f"safe set {self.kept:.0%} of the space outside U")
         parts.append(self.eta())

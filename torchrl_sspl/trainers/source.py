@@ -89,6 +89,7 @@ class Source:
         changes = augmentation if changes is None else changes
         self.changes = changes if changes is not None and changes.share > 0.0 else None  # what changes nothing is not looked at twice
         self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
+        self.tell: Callable[[int], None] = lambda transitions: None  # how many it has taken, whenever there are more
 
     @cached_property
     def env(self) -> Any:
@@ -112,6 +113,7 @@ class Source:
         self.budget["labels of S"] += int((region == SAFE).sum())
         self.budget["labels of U"] += int((region == UNSAFE).sum())
         self.budget["resets"] += (store.n_frames - n) // 2  # an episode has two frames more than transitions
+        self.tell(self.budget["transitions"])
 
     def count_labels(self, answers: Tensor) -> None:
         """Adds labels ``(n,)`` that were asked for to the budget, with those that say that a picture is of neither set."""
@@ -198,6 +200,7 @@ class Source:
             kept = entry.saved()
             if kept is not None:
                 self.budget = kept["budget"]
+                self.tell(self.budget["transitions"])
                 parts.append(kept["latents"])
                 continue
             changes = None if self.augmentation is None else self.augmentation.with_seed(seed)
