@@ -18,6 +18,7 @@ from tensordict import TensorDict
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_sspl.data import collect_random
+from torchrl_sspl.envs import games
 from torchrl_sspl.envs.games import area_averaged
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 from torchrl_sspl.errors import ConfigError, OverlapError, WorkerError
@@ -276,13 +277,66 @@ def test_processes_end_with_the_environment(end):
 
 
 @spread
-def test_signals_are_for_the_parent():
+def test_a_process_that_does_not_end_is_killed(monkeypatch):
+    class Stubborn(Slider):
+        def close(self):
+            time.sleep(60)
+
+    monkeypatch.setattr(games, "_PATIENCE", 0.1)
+    env, began = slider(2, make=Stubborn, workers=2), time.monotonic()
+    processes = env._games.processes
+    env.close()
+    assert not any(map(running, processes))
+    assert time.monotonic() - began < 30
+
+
+@spread
+def test_a_fork_of_the_parent_leaves_them_alone():
     env = slider(2, workers=2)
-    for number in (signal.SIGINT, signal.SIGTERM):
-        for pid in env._games.processes:
-            os.kill(pid, number)
+    fork = os.fork()
+    if fork == 0:
+        env._games.close()
+        os._exit(0)
+    os.waitpid(fork, 0)
     assert env.reset()["state"].shape == (2, 1)
     env.close()
+
+
+@spread
+def test_signals_are_for_the_parent():
+    # Whoever has drawn with pygame does not end on SIGTERM anyway.
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in (signal.SIGINT, signal.SIGTERM)}
+    env = slider(2, workers=2)
+    for number, handler in before.items():
+        for pid in env._games.processes:
+            os.kill(pid, number)
+        signal.signal(number, handler)
+    assert env.reset()["state"].shape == (2, 1)
+    env.close()
+
+
+@spread
+def test_what_is_printed_is_printed_once_and_a_child_has_one_thread(tmp_path, monkeypatch):
+    def unsafe(state, info):
+        print("judged", end="")
+        return torch.get_num_threads() > 1
+
+    threads, stdout = torch.get_num_threads(), os.dup(1)
+    with (tmp_path / "printed").open("w") as file:
+        os.dup2(file.fileno(), 1)  # the only open files that a child keeps are those of every process
+    with open(1, "w", closefd=False) as stream:
+        monkeypatch.setattr("sys.stdout", stream)
+        print("before", end="")
+        torch.set_num_threads(2)
+        env = slider(2, workers=2, unsafe=unsafe)
+        torch.set_num_threads(threads)
+        assert (env.reset()["region"] != UNSAFE).all()
+        env.close()
+    os.dup2(stdout, 1)
+    os.close(stdout)
+    printed = (tmp_path / "printed").read_text()
+    assert printed.count("before") == 1
+    assert printed.count("judged") >= 2
 
 
 @spread
