@@ -19,6 +19,7 @@ from torchrl_sspl.journal import FOLDER, Entry, journal, kept_parts
 from torchrl_sspl.lipschitz import SandwichBarrier
 from torchrl_sspl.modules import LatentDynamics, Policy
 from torchrl_sspl.modules.agent import load
+from torchrl_sspl.viability import grid, viability_kernel
 
 
 class Killed(BaseException):
@@ -204,6 +205,30 @@ def test_a_signal_ends_a_proof_when_it_is_saved(tmp_path, monkeypatch):
     assert "status" not in torch.load(path)
 
 
+def test_a_viability_kernel_goes_on_with_its_sweeps(tmp_path, monkeypatch):
+    def kernel():
+        return viability_kernel(
+            lambda x, u: 1.2 * x + u, low=[-1.0], high=[1.0], resolution=101, margin=lambda x: 1.0 - x[:, 0].abs(),
+            actions=torch.linspace(-0.1, 0.1, 5)[:, None],
+        )  # fmt: skip
+
+    expected, sweep = kernel(), (grid._Problem, "best_successor")
+    assert expected.iterations > 6
+    with monkeypatch.context() as patch, journal_of_a_killed_run(tmp_path, "run"):
+        killed_after(4, patch, *sweep)
+        kernel()
+    with monkeypatch.context() as patch, journal_of_a_killed_run(tmp_path, "run"):
+        count = killed_after(10**9, patch, *sweep)
+        found = kernel()
+    assert count[0] == expected.iterations - 4
+    with monkeypatch.context() as patch, journal(tmp_path, "run"):
+        killed_after(0, patch, *sweep)
+        again = kernel()
+    for one in (found, again):
+        assert torch.equal(one.value, expected.value)
+        assert (one.iterations, one.change) == (expected.iterations, expected.change)
+
+
 def test_episodes_and_latents_are_not_made_again(tmp_path, monkeypatch):
     from torchrl_sspl.evaluation import known, simulation
 
@@ -226,6 +251,18 @@ def test_episodes_and_latents_are_not_made_again(tmp_path, monkeypatch):
     for name in ("states", "barrier", "latent", "actions", "alive"):
         assert torch.equal(getattr(expected[1], name), getattr(found[1], name)), name
     assert expected[1].events.keys() == found[1].events.keys()
+
+
+def test_every_piece_is_heard_of_in_parts_of_parts_too(tmp_path):
+    beats: list[int] = []
+    with journal(tmp_path, "run", beat=lambda: beats.append(1)):
+        kept_parts(str, range(3), "texts")
+        assert len(beats) == 4
+        with journal(None, "part"):
+            Entry("a")
+    assert len(beats) == 5
+    Entry("b")
+    assert len(beats) == 5
 
 
 def test_no_part_is_computed_twice_and_parts_of_something_else_are(tmp_path):

@@ -29,6 +29,7 @@ _SHORT = 1.0  # seconds up to which nothing is worth a file
 @dataclass
 class _Journal:
     folder: Path
+    beat: Callable[[], None]
     entries: int = 0  # that were asked for: their order is the same when it is done again
 
 
@@ -36,7 +37,7 @@ _journal: ContextVar[_Journal | None] = ContextVar("journal", default=None)
 
 
 @contextmanager
-def journal(directory: Path | None, name: str, *about: Any) -> Iterator[None]:
+def journal(directory: Path | None, name: str, *about: Any, beat: Callable[[], None] | None = None) -> Iterator[None]:
     """Inside, an :class:`Entry` keeps what was computed; after an interruption the same computation takes it from there.
 
     Args:
@@ -45,6 +46,7 @@ def journal(directory: Path | None, name: str, *about: Any) -> Iterator[None]:
         name: of the part of the run.
         about: what the results depend on (tensors, and what prints the same in every process), beside what the journal around depends
             on; of anything else they are not taken.
+        beat: called with every piece of what is computed, so that somebody sees that it goes on; that of the journal around if not given.
 
     Source: none.
 
@@ -65,13 +67,17 @@ def journal(directory: Path | None, name: str, *about: Any) -> Iterator[None]:
     for old in root.glob(f"{name}-*"):  # of other weights, or other settings
         if old != folder:
             shutil.rmtree(old, ignore_errors=True)
-    token = _journal.set(_Journal(folder))
+    token = _journal.set(_Journal(folder, beat or (around.beat if around is not None else _silent)))
     try:
         yield
     finally:
         _journal.reset(token)
     if around is None:
         shutil.rmtree(root, ignore_errors=True)
+
+
+def _silent() -> None:
+    """Nobody listens."""
 
 
 class Entry:
@@ -91,8 +97,11 @@ class Entry:
     def __init__(self, *about: Any) -> None:
         self._began = self._written = time.monotonic()
         self._path: Path | None = None
+        self._beat = _silent
         opened = _journal.get()
         if opened is not None:
+            self._beat = opened.beat
+            self._beat()
             opened.entries += 1
             self._path = opened.folder / f"{opened.entries:05d}-{_digest(about)}.pt"
 
@@ -106,7 +115,8 @@ class Entry:
 
     @property
     def due(self) -> bool:
-        """Whether it is time to save what is not complete, or somebody waits for that."""
+        """Whether it is time to save what is not complete, or somebody waits for that; asked with every piece of it."""
+        self._beat()
         return self._path is not None and (pending() or time.monotonic() - self._written >= _EVERY)
 
     def save(self, value: Any, *, complete: bool = False) -> None:

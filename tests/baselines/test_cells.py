@@ -7,6 +7,7 @@ import json
 import pytest
 import torch
 
+from torchrl_sspl.baselines import make, scoring
 from torchrl_sspl.baselines.__main__ import main
 from torchrl_sspl.baselines.base import BUDGETS, Budget, Needs
 from torchrl_sspl.baselines.cell import ROW_FILE, Cell, run_cell, stored, text
@@ -93,6 +94,21 @@ def test_a_recording_holds_what_was_asked_for():
     assert torch.equal(found.frames, again.frames)
     assert found.labels() == {"transitions": 72, "safe_labels": found.count(SAFE), "unsafe_labels": found.count(UNSAFE)}
     assert len(found.joined(again)) == 144
+
+
+@pytest.mark.parametrize("n", [6, 30])
+def test_as_many_episodes_place_the_level_as_were_asked_for_under_both_nominal_policies(n, monkeypatch):
+    blocks, whole = [], scoring.paths
+
+    def counted(method, env, start, nominal, horizon):
+        blocks.append((len(start), bool((nominal(torch.ones(1, 2)) != 0).any())))
+        return whole(method, env, start, nominal, horizon)
+
+    monkeypatch.setattr(scoring, "paths", counted)
+    env, method = PendulumEnv(), make("lqr")
+    method.fit(None, env, BUDGETS["tiny"], 0)
+    scoring.score(method, env, scoring.ScoreConfig(episodes=10, horizon=3, grid=21, kernel_grid=31, frames=1, check_episodes=n))
+    assert blocks == [(10, False), (10, True), (n // 2, False), (n // 2, True), (10, False), (10, True)]
 
 
 def test_budgets_are_those_of_the_protocol():

@@ -64,6 +64,13 @@ def test_several_seeds_are_a_mean_and_the_worst():
     text = markdown(list(zip(asked, [row(0.5), row(0.7)], strict=True)))
     assert "60.0 % (50.0 %) | 60.0 % (70.0 %)" in text
     assert "✗ ✗ ✗ ✗ ✓ ✗" in text
+    assert "seeds" not in text
+    text = markdown(list(zip(asked, [row(0.5), "SolverError: no"], strict=True)))
+    assert "| latent_cbf (1 of 2 seeds; SolverError: no) | small | 50.0 %" in text  # what is missing is no mean
+    empty = row(0.5)
+    empty["measurements"]["false_safe"] = {"value": None}
+    text = markdown(list(zip(asked, [row(0.7), empty], strict=True)))
+    assert "60.0 % (50.0 %) | 70.0 %, 1 of 2 seeds |" in text
 
 
 def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():

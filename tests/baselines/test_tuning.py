@@ -86,5 +86,10 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
     assert "tuning" not in run_cell(Cell.of("nerf_cbf", ["steps=2", *SMALL]))
     assert Cell.of("lqr", ["trials=8"]).trials == 0
     assert SEED not in (0, 1, 2)
+    told["of"]["horizon"] = 7
+    path.write_text(json.dumps(told))  # trials of something else
+    assert run_cell(Cell.of("nerf_cbf", ["seed=2", *words]))["tuning"]["chosen"] == first["tuning"]["chosen"]
+    with pytest.raises(ConfigError, match=f"another seed than {SEED}"):
+        Cell.of("nerf_cbf", [f"seed={SEED}", "trials=3"])
     with pytest.raises(ConfigError, match="expected trials to be an integer"):
         Cell.of("nerf_cbf", ["trials=few"])

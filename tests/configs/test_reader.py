@@ -397,3 +397,18 @@ def test_reading_a_configuration_loads_no_environment():
     code = "import sys; from torchrl_sspl.configs import compose; compose(['env=pendulum', 'seed=1']); print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "False\n"
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("synthesis.grid=1", "at least 3 nodes"), ("synthesis.grid=41", "synthesis.teacher=value"),
+        ("synthesis.rollout_transitions=0", "rollout_transitions >= 1 with synthesis.rounds=2"), ("evaluation.horizon=0", "evaluation.horizon >= 1"),
+        ("evaluation.certificate_seconds=-1", "evaluation.certificate_seconds >= 0"), ("seed=-1", "seed >= 0"), ("synthesis.batch=0", "synthesis.batch >= 1"),
+        ("synthesis.dynamics_outlier=-0.1", "synthesis.dynamics_outlier >= 0"), ("synthesis.episode_steps=-3", "synthesis.episode_steps >= 1"),
+    ],
+)  # fmt: skip
+def test_what_would_fail_after_the_joint_training_is_refused_before(word, message):
+    with pytest.raises(ConfigError, match=message):
+        compose(["env=pendulum", "synthesis.rounds=2", word])
+    assert compose(["env=pendulum", "synthesis.episode_steps=null"]).synthesis.episode_steps is None

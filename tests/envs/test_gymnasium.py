@@ -21,7 +21,7 @@ from torchrl_sspl.data import collect_random
 from torchrl_sspl.envs import games
 from torchrl_sspl.envs.games import area_averaged
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
-from torchrl_sspl.errors import ConfigError, OverlapError, WorkerError
+from torchrl_sspl.errors import ConfigError, NonFiniteError, OverlapError, WorkerError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 
@@ -117,6 +117,15 @@ def test_components_keep_their_own_ranges():
     assert env.action_spec.space.high.tolist() == [[2.0, 1.0]]
 
 
+def test_whole_numbers_are_the_nearest():
+    env = slider(1, make=partial(Slider, spaces.Box(0, 10, (1,), np.int64)), settle=False)
+    env.reset()
+    game = env._games.games[0].env
+    for action in (-5.0, 0.6, 4.9, 5.0):
+        env.step(TensorDict(action=torch.tensor([[action]]), batch_size=[1]))
+    assert [int(a[0]) for a in game.actions] == [0, 6, 10, 10]
+
+
 @pytest.mark.parametrize(("action", "choice"), [(-1.0, 5), (-0.4, 5), (-0.2, 6), (0.2, 6), (0.4, 7), (1.0, 7), (9.0, 7)])
 def test_discrete_actions_cut_the_interval_into_equal_parts(action, choice):
     env = slider(1, make=lambda: Slider(spaces.Discrete(3, start=5)))
@@ -182,8 +191,25 @@ def test_what_cannot_work_is_refused():
         slider(make=lambda: gymnasium.make("CartPole-v1"))
     with pytest.raises(ConfigError, match="finite bounds"):
         slider(make=lambda: Slider(spaces.Box(-np.inf, np.inf, (1,), np.float32)))
+    closed = []
+
+    class Closed(Slider):
+        def close(self):
+            closed.append(True)
+
+    largest = float(np.finfo(np.float32).max)
+    with pytest.raises(ConfigError, match="finite bounds"):
+        slider(1, make=lambda: Closed(spaces.Box(-largest, largest, (1,), np.float32)))
+    assert closed == [True]
     with pytest.raises(ConfigError, match="finite bounds"):
         slider(make=lambda: Slider(spaces.MultiBinary(3)))
+    with pytest.raises(ConfigError, match=r"safe: expected a predicate .* AttributeError"):
+        slider(safe=lambda state, info: state.angle > 0).reset()
+    for space in (None, spaces.Discrete(3)):
+        env = slider(2, make=partial(Slider, space))
+        env.reset()
+        with pytest.raises(NonFiniteError, match="NaN"):
+            env.step(TensorDict(action=torch.full((2, 1), torch.nan), batch_size=[2]))
     with pytest.raises(OverlapError, match="exclude each other"):
         slider(unsafe=lambda state, info: True, reset_options={"x": 1.0}).reset()
     with pytest.raises(ConfigError, match="survives one step"):
@@ -274,6 +300,18 @@ def test_processes_end_with_the_environment(end):
     del env
     gc.collect()
     assert not any(map(running, processes))
+
+
+@spread
+def test_without_a_further_process_signals_reach_the_parent_again(monkeypatch):
+    def fail():
+        raise BlockingIOError("no more processes")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fork", fail)
+        with pytest.raises(WorkerError, match="expected 2 processes, received no more processes for number 1"):
+            slider(2, workers=2)
+    assert not signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 @spread

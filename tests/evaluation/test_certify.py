@@ -363,11 +363,14 @@ def test_part_of_the_blocks_is_said_to_be_a_part(tmp_path, monkeypatch):
 def test_a_certificate_is_issued_again_with_its_own_settings(tmp_path):
     agent = line_agent()
     agent.save(tmp_path / "agent")
-    certify(agent, Line(), name="line", episodes=30, horizon=2, seed=4, acceptable=0.3).save(tmp_path / "agent" / "certificate.json")
+    settings = {"episodes": 30, "horizon": 2, "seed": 4, "acceptable": 0.3, "level": -0.01, "used_seeds": [4, 7]}
+    certify(agent, Line(), name="line", **settings).save(tmp_path / "agent" / "certificate.json")
     before = (tmp_path / "agent" / "certificate.json").read_text()
     issue(tmp_path, Line())
     assert (tmp_path / "agent" / "certificate.json").read_text() == before
-    assert issue(tmp_path, Line(), seed=5).record.seed == 5
+    again = issue(tmp_path, Line(), seed=5)
+    assert (again.record.seed, again.level) == (5, -0.01)
+    assert {4, 7} <= set(again.record.used)  # what was used once is fresh never again
     (tmp_path / "agent" / "certificate.json").unlink()
     assert issue(tmp_path).agent == tmp_path.name.replace("[", "_").replace("]", "_")
 

@@ -20,7 +20,7 @@ from torchrl_sspl.evaluation.known import _Run, barrier_of, encode_states, evalu
 from torchrl_sspl.evaluation.measurements import Evaluation, quantiles, share
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.agent import Agent, load
 from torchrl_sspl.sets import Box
 from torchrl_sspl.viability import viability_kernel
 
@@ -209,6 +209,34 @@ def test_quantiles_are_order_statistics():
     assert out["none_max"] is None
     assert share("s", 0, 0).value is None
     assert share("s", 0, 3000).upper == pytest.approx(1 - 0.05 ** (1 / 3000))
+
+
+def test_who_leaves_where_that_counts_as_u_has_entered_it():
+    far = Box([1.0, -2.0], [1.1, 2.0])  # nobody comes there: whoever falls to the other side leaves before
+
+    env = PendulumEnv(seed=0, image_size=16, unsafe_set=far)
+    sizes = EvaluationConfig(episodes=20, horizon=60, grid=11, kernel_grid=31)
+    found = evaluate(lambda pixels: torch.full((len(pixels), 1), -10.0), env, sizes)
+    assert found["labelled_safe_rollouts_touch_unsafe"] == 1.0
+
+
+def test_steps_that_nobody_looked_at_are_not_counted():
+    """A car that has left its arena stands still, and nothing is asked of it."""
+    agent, env = load("quadruped"), DubinsEnv(seed=0, image_size=128)
+    sizes = EvaluationConfig(episodes=40, horizon=60, grid=9, kernel_grid=21)
+    found = evaluate(agent, env, sizes)
+    steps = found.measurements["corrections_cut"].n
+    assert 40 < steps < 40 * 60 / 2
+    assert found.measurements["on_policy_step_error_q99"].n == steps
+
+
+def test_only_what_is_drawn_has_bounds():
+    found = of_small_agent().measurements
+    for name in ("unsafe_called_safe", "volume_over_kernel", "q2_with_margin", "q3_with_margin"):  # nodes of a grid
+        assert found[name].value is not None
+        assert found[name].upper is None
+    assert found["q1_with_margin"].upper is not None
+    assert found["safe_called_unsafe"].upper is not None
 
 
 def test_nothing_here_asks_for_the_name_of_a_type():

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 import torch
 from evaluation.systems import Lane, Where, lane
+from gymnasium import spaces
 from tensordict import TensorDict
 from tiny import TINY_PHASES
 from torch import nn
+from torchrl.data import Bounded
 
 from torchrl_sspl.certification import Certificate, Layer, Statement
 from torchrl_sspl.cli import evaluate_agent
@@ -187,6 +189,16 @@ def test_the_budget_counts_what_was_seen(tmp_path):
     assert 0 < budget["resets"] == (experiment.store.n_frames - 256) // 2
 
 
+def test_the_budget_is_known_to_a_run_that_goes_on_without_its_pictures(tmp_path):
+    words = ["trainer.total_frames=128", "synthesis.enabled=false", "evaluation.calibrate=true", "evaluation.episodes=4"]
+    first = build(tmp_path, *words)
+    first.train()
+    again = build(tmp_path, *words)
+    again.train()
+    assert again._budget() == first._budget()
+    assert again._budget()["transitions"] == 128
+
+
 def test_a_finished_experiment_is_not_trained_again_and_another_one_is_refused(tmp_path):
     first = build(tmp_path, "trainer.total_frames=128").train().state_dict()
     again = build(tmp_path, "trainer.total_frames=128")
@@ -277,6 +289,26 @@ def test_an_agent_of_a_system_in_code_is_not_measured_on_another(tmp_path):
     build(tmp_path, "trainer.total_frames=128").train()
     with pytest.raises(CheckpointError, match="it was given in code; call evaluate_episodes"):
         evaluate_agent(str(tmp_path))
+
+
+class ManyActions(Lane):
+    action_space = spaces.Box(-1.0, 1.0, (14,), np.float32)
+
+
+def uncentred(batch_size, seed):
+    env = lane(batch_size=batch_size, seed=seed)
+    env.action_spec = Bounded(0.0, 2.0, (*batch_size, 1))
+    return env
+
+
+def test_what_would_fail_after_hours_is_refused_at_once(tmp_path):
+    with pytest.raises(ConfigError, match=r"between -a and a .* received bounds \[0.0\] and \[2.0\]"):
+        Experiment(compose([*SMALL, f"out_dir={tmp_path}"]), uncentred)
+    with pytest.raises(ConfigError, match=r"evaluation\.episodes >= 1, whose pictures place the zero level"):
+        Experiment(compose([*SMALL, "evaluation.episodes=0", "evaluation.calibrate=true", f"out_dir={tmp_path}"]), lane)
+    many = partial(lane, make=ManyActions)
+    with pytest.raises(ConfigError, match="at most 12 action dimensions, received 14"):
+        Experiment(compose([*SMALL, f"out_dir={tmp_path}"]), many)
 
 
 def test_environments_without_labels_are_refused(tmp_path):

@@ -170,6 +170,9 @@ def test_bad_actions_are_refused():
         shield()(torch.zeros(2, 1), torch.zeros(2, 2))
     with pytest.raises(NonFiniteError, match="protected"):
         shield()(torch.zeros(1, 1), torch.full((1, 1), math.nan))
+    with pytest.raises(NonFiniteError, match="latent"):
+        shield()(torch.full((1, 1), math.nan), torch.zeros(1, 1))
+    assert shield()(torch.zeros(1, 1), torch.zeros(1, 1, dtype=torch.float64)).action.dtype == torch.float32
 
 
 def test_an_agent_without_a_proof_needs_a_margin():
@@ -288,6 +291,13 @@ def test_the_wrapper_says_when_the_proof_no_longer_applies():
     assert [t["inside"] for t in told] == [True, True, True]
     assert [t["applies"] for t in told] == [True, False, False]
     assert wrapped.reset(seed=0)[1]["safety"]["applies"]
+
+
+@pytest.mark.parametrize(("margin", "applies"), [(None, True), (0.0, False), (1.0, True)])
+def test_with_a_margin_below_the_proved_one_no_proof_applies(margin, applies):
+    wrapped = SafetyWrapper(Gym(), load("pendulum"), margin=margin)
+    assert wrapped.reset(seed=5)[1]["safety"]["inside"]
+    assert wrapped.reset(seed=5)[1]["safety"]["applies"] == applies
 
 
 @pytest.mark.parametrize(

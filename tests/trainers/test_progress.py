@@ -54,6 +54,18 @@ def test_phase_loss_and_volume_are_in_the_bar_and_the_loss_is_asked_for_once_a_s
     assert 3 <= len(asked) <= 5
 
 
+def test_the_clock_goes_on_while_there_are_no_steps(clock):
+    file = io.StringIO()
+    bar = Progress(100, 30, file=file)
+    bar.begin("checking on fresh episodes", 1, left=1)
+    sizes = [len(file.getvalue())]
+    for seconds in (0.0, 0.0, 2.0):  # once a second is enough
+        clock.seconds += seconds
+        bar.beat()
+        sizes.append(len(file.getvalue()))
+    assert sizes[0] < sizes[1] == sizes[2] < sizes[3]
+
+
 def test_a_file_says_the_same_without_a_bar_until_the_end(clock, tmp_path):
     bar, file = Progress(30, 10, shown=False, out_dir=tmp_path), tmp_path / "progress.json"
     bar.begin("fitting", 20, left=2)

@@ -12,7 +12,7 @@ from torchrl_sspl.envs.system import Requirement
 from torchrl_sspl.evaluation.measurements import Evaluation, share
 from torchrl_sspl.modules.agent import agent_directory
 from torchrl_sspl.viz.report import badge, bounded, requirement_rows
-from torchrl_sspl.viz.verdict import first_screen
+from torchrl_sspl.viz.verdict import _line, first_screen
 
 TOUCH = Requirement("safe_rollouts_touch_unsafe", "episodes that touch U", "<=", 0.01, 0.0)
 LEAVE = Requirement("leave", "episodes that leave", "<=", 0.0, 0.0)
@@ -115,3 +115,13 @@ def test_a_verdict_stands_only_where_the_bound_reaches_the_must(requirement, eve
     said = requirement.verdict(SimpleNamespace(measurements={requirement.name: m}))
     assert bounded(requirement, said, m) == verdict
     assert (badge(bounded(requirement, said, m)).kind == "good") == (verdict == "aim")
+
+
+def test_nodes_of_a_grid_have_no_bound():
+    nodes = dataclasses.replace(share("unsafe_called_safe", 0, 31_816), lower=None, upper=None)
+    none, most = Requirement("unsafe_called_safe", "grid of U", "<=", 0.0, 0.0), Requirement("v", "volume", ">=", 0.5, 0.9)
+    assert bounded(none, "aim", nodes) == "none seen"
+    volume = dataclasses.replace(share("v", 7, 10), lower=None, upper=None)
+    assert bounded(most, "must", volume) == "must"
+    lines = [_line(row) for row in [(most.label, volume, ">= 0.5", "", "must"), (none.label, nodes, "<= 0", "", "none seen")]]
+    assert lines == ["Volume: 70 % of 10 (must be >= 0.5).", "Grid of U: none of 31,816 (must be <= 0)."]

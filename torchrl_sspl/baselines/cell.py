@@ -83,6 +83,8 @@ class Cell:
         for number in ("seed", "trials"):
             if not own.get(number, "0").isdigit():
                 raise ConfigError(f"expected {number} to be an integer >= 0, received '{own[number]}'")
+        if int(own.get("trials", 0)) and int(own.get("seed", 0)) == tuning.SEED:
+            raise ConfigError(f"expected another seed than {tuning.SEED} with trials, which are made with that one, received it")
         try:
             sizes: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ScoreConfig), OmegaConf.from_dotlist(scores)))
         except OmegaConfBaseException as error:
@@ -171,9 +173,14 @@ def _fit(method: SafetyMethod, env: SafetyEnv, cell: Cell, seed: int) -> None:
 def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
     """Options that trials have chosen, and the trials; they are the same for all scored seeds, and made once."""
     path = (cell.directory if cell.out_dir else cell.directory.parent) / TRIALS_FILE
+    horizon = cell.score.horizon or 60
+    asked = {
+        "method": cell.method, "env": cell.env, "budget": cell.budget, "options": list(cell.options), "trials": cell.trials, "horizon": horizon,
+    }  # fmt: skip
     if path.is_file():
         told = json.loads(path.read_text())
-        return told["chosen"], told["trials"]
+        if told.get("of") == asked:
+            return told["chosen"], told["trials"]
     env = replace(cell, seed=tuning.SEED).environment()
 
     def trial(words: Sequence[str]) -> float:
@@ -181,10 +188,10 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
         with tempfile.TemporaryDirectory() as where:
             method.directory = Path(where)
             _fit(method, env, cell, tuning.SEED)
-            return tuning.merit(method, env, horizon=cell.score.horizon or 60)
+            return tuning.merit(method, env, horizon=horizon)
 
     chosen, trials = tuning.search(trial, tuning.draws(cell.method, cell.trials))
-    write(path, json.dumps({"chosen": list(chosen), "trials": trials}, indent=1) + "\n")
+    write(path, json.dumps({"of": asked, "chosen": list(chosen), "trials": trials}, indent=1) + "\n")
     return chosen, trials
 
 

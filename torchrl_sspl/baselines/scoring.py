@@ -158,9 +158,9 @@ class _Score:
     def episodes(self, start: Tensor, nominal: Nominal) -> tuple[Guarded, Tensor]:
         return paths(self.method, self.env, start, nominal, self.config.horizon)
 
-    def starts(self, keep, index: int) -> Tensor:
+    def starts(self, keep, index: int, n: int) -> Tensor:
         generator = torch.Generator().manual_seed(self.config.seed + index)
-        return states_where(keep, self.env.state_space, self.config.episodes, generator)
+        return states_where(keep, self.env.state_space, n, generator)
 
 
 @torch.no_grad()
@@ -255,15 +255,18 @@ def _sets(it: _Score) -> tuple[Tensor, Tensor, Tensor] | None:
     return barrier, viable, unsafe
 
 
-def _count_sets(out: Evaluation, prefix: str, claimed: Tensor, viable: Tensor, unsafe: Tensor) -> None:
-    out.count(f"{prefix}claimed_over_kernel", claimed & viable, "cells of the true kernel that are claimed", viable)
-    out.count(f"{prefix}false_safe", claimed & ~viable, "claimed cells outside the true kernel", claimed)
-    out.count(f"{prefix}unsafe_called_safe", claimed & unsafe, "cells of U that are claimed", unsafe)
+def _count_sets(out: Evaluation, prefix: str, claimed: Tensor, viable: Tensor, unsafe: Tensor, *, independent: bool = False) -> None:
+    for name, events, note, of in (
+        ("claimed_over_kernel", claimed & viable, "cells of the true kernel that are claimed", viable),
+        ("false_safe", claimed & ~viable, "claimed cells outside the true kernel", claimed),
+        ("unsafe_called_safe", claimed & unsafe, "cells of U that are claimed", unsafe),
+    ):
+        out.count(f"{prefix}{name}", events, note, of, independent=independent)
 
 
 def _loops(it: _Score, name: str, keep, index: int) -> list[tuple[Tensor, Tensor]]:
     """Episodes from a set, under both nominal policies; returns starts and which of them enter U."""
-    start = it.starts(keep, index)
+    start = it.starts(keep, index, it.config.episodes)
     found = []
     for label, make in zip(NOMINALS, (harmless, adversarial), strict=True):
         key, where = f"{name}_{label}", f"episodes of {it.config.horizon} steps from the {name} set, {label} nominal policy"
@@ -286,8 +289,8 @@ def _calibrated(it: _Score, sets: tuple[Tensor, Tensor, Tensor], found: list[tup
     if len(found) < 2:
         it.out.missing("calibrated_claimed_over_kernel", "calibrated_false_safe", "calibrated_unsafe_called_safe", *names, note="nothing is claimed")
         return
-    check, n = it.starts(it.inside, 2), it.config.check_episodes
-    half = check[: n // 2], check[n // 2 : n]
+    check = it.starts(it.inside, 2, it.config.check_episodes)
+    half = check[: len(check) // 2], check[len(check) // 2 :]
     both = [(x, it.episodes(x, make(it.env))[1]) for x, make in zip(half, (harmless, adversarial), strict=True) if len(x)]
     value = it.barrier(torch.cat([x for x, _ in both]))
     assert value is not None
@@ -310,12 +313,15 @@ def calibrated_level(barrier: Tensor, entered: Tensor, share: float = _ENTER) ->
         >>> value = torch.tensor([-0.1, -0.2, -0.3])
         >>> round(calibrated_level(value, torch.tensor([True, False, False])), 6), calibrated_level(value, torch.zeros(3, dtype=torch.bool))
         (-0.2, 0.0)
+        >>> calibrated_level(torch.tensor([-0.1, -0.1]), torch.tensor([False, True]))  # those at the level belong to it
+        -inf
     """
     if not len(barrier) or not bool(entered.any()):
         return 0.0
     order = barrier.argsort()
     entered_before = entered[order].float().cumsum(0) / torch.arange(1, len(order) + 1)
-    good = (entered_before <= share).nonzero()
+    last_of_its_value = barrier[order].diff(append=torch.tensor([math.inf])) > 0
+    good = ((entered_before <= share) & last_of_its_value).nonzero()
     if not len(good):
         return -math.inf
     last = int(good[-1])
@@ -349,7 +355,7 @@ def _shifted(it: _Score) -> None:
             it.out.missing(*(f"shifted_{name}_{n}" for n in CLAIMS), note=str(error))
             continue
         assert claimed is not None
-        _count_sets(it.out, f"shifted_{name}_", claimed <= 0, viable, unsafe)
+        _count_sets(it.out, f"shifted_{name}_", claimed <= 0, viable, unsafe, independent=True)
 
 
 __all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "middles", "paths", "score", "sizes_of", "well_inside"]

@@ -137,6 +137,9 @@ def markdown(rows: Sequence[tuple[Cell, dict[str, Any] | str]]) -> str:
                 lines.append(_line([label, budget, str(found[0]), *[""] * (len(head) - 3)]))
                 continue
             first = good[0]
+            if len(good) < len(found):
+                reason = next(str(row) for row in found if not isinstance(row, dict))
+                label = f"{label} ({len(good)} of {len(found)} seeds; {reason})"
             episodes = str(first["measurements"].get("common_harmless_enter", {}).get("n"))
             lines.append(_line([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes]))
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
@@ -172,7 +175,8 @@ def _value(rows: list[dict[str, Any]], column: tuple[str, str, bool, Any]) -> st
         return f"{100 * value:.1f} %" if share else f"{value:.2f}"
 
     mean = show(sum(values) / len(values))
-    return mean if len(values) == 1 else f"{mean} ({show(worst(values))})"
+    shown = mean if len(values) == 1 else f"{mean} ({show(worst(values))})"
+    return shown if len(values) == len(rows) else f"{shown}, {len(values)} of {len(rows)} seeds"
 
 
 def _latency(rows: list[dict[str, Any]]) -> str:

@@ -22,6 +22,16 @@ _CHOICES = {
     "logger.kind": ("csv", "wandb", "tensorboard", "none"),
 }
 
+#: Values that would fail only when everything before them is trained.
+_LEAST = {
+    0: "seed evaluation.seed evaluation.walk_seed evaluation.episodes evaluation.walks evaluation.renderer_episodes evaluation.grid "
+    "evaluation.kernel_grid evaluation.certificate_episodes evaluation.certificate_seconds synthesis.steady_steps synthesis.dynamics_steps "
+    "synthesis.teach_steps synthesis.fit_steps synthesis.steer_steps synthesis.tune_steps synthesis.tighten_steps synthesis.dynamics_outlier "
+    "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices",
+    1: "evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.batch synthesis.residuals synthesis.actions "
+    "synthesis.rim_draws synthesis.check_episodes synthesis.check_horizon",
+}
+
 
 def _option(default: Any, meaning: str) -> Any:
     """A field with its meaning and its default: a value, a list that is copied, or what makes a section."""
@@ -353,7 +363,24 @@ class Config:
             raise ConfigError(f"expected labels.choose=0 with synthesis.enabled=false, received {self.labels.choose}: pictures are chosen on its latents")
         if self.synthesis.rounds < 1:
             raise ConfigError(f"expected synthesis.rounds >= 1, received {self.synthesis.rounds}; synthesis.enabled=false for none")
+        self._check_least()
+        s = self.synthesis
+        if s.grid and (s.grid < 3 or s.teacher != "value"):
+            raise ConfigError(
+                f"expected synthesis.grid=0, or at least 3 nodes and synthesis.teacher=value, whose policy the targets on a grid take "
+                f"over, received grid={s.grid} and teacher={s.teacher}"
+            )
+        if s.rounds > 1 and s.rollout_transitions < 1:
+            raise ConfigError(f"expected synthesis.rollout_transitions >= 1 with synthesis.rounds={s.rounds}, received {s.rollout_transitions}")
         return self
+
+    def _check_least(self) -> None:
+        for least, keys in _LEAST.items():
+            for key in keys.split():
+                section, _, name = key.rpartition(".")
+                value = getattr(getattr(self, section) if section else self, name)
+                if value is not None and not value >= least:
+                    raise ConfigError(f"expected {key} >= {least}, received {value}")
 
 
 __all__ = [

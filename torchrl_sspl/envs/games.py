@@ -113,7 +113,7 @@ class Game:
     def _judged(name: str, predicate: Predicate, observation: Any, info: Mapping[str, Any]) -> bool:
         try:
             return bool(predicate(observation, info))
-        except (TypeError, ValueError, LookupError) as error:
+        except (TypeError, ValueError, LookupError, AttributeError) as error:
             raise ConfigError(
                 f"{name}: expected a predicate (observation, info) -> bool of one state, received "
                 f"{type(error).__name__}: {error}"
@@ -162,12 +162,17 @@ class SpreadGames:
             here, there = Pipe()
             # Signals are blocked in the child for ever, and in the parent for as long as a child could take them for its own.
             blocked = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
-            with warnings.catch_warnings():  # of threads, none of which a child needs
-                warnings.simplefilter("ignore", DeprecationWarning)
-                pid = os.fork()
-            if pid == 0:
-                _serve(there, build, [k for k in range(count) if self._owner[k] == worker])
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+            try:
+                with warnings.catch_warnings():  # of threads, none of which a child needs
+                    warnings.simplefilter("ignore", DeprecationWarning)
+                    pid = os.fork()
+                if pid == 0:
+                    _serve(there, build, [k for k in range(count) if self._owner[k] == worker])
+            except OSError as error:
+                self.close()
+                raise WorkerError(f"workers: expected {workers} processes, received {error} for number {worker + 1}; lower it") from error
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
             there.close()
             self._pipes.append(here)
             self.processes.append(pid)

@@ -16,8 +16,9 @@ from torchrl.envs import EnvBase
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import set_specs
 from torchrl_sspl.envs.games import Game, Games, Moment, Picture, Predicate, SpreadGames
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, NonFiniteError
 
+_LARGE = 1e30  # what calls itself bounded by more than that is not
 _ATTEMPTS = 20
 
 
@@ -125,7 +126,11 @@ class GymnasiumPixels(EnvBase):
         )
         self._games = Games(build, n) if workers == 1 else SpreadGames(build, n, workers)
         observed, acted = self._games.ask("spaces", {0: ()})[0]
-        self._read_action_space(acted)
+        try:
+            self._read_action_space(acted)
+        except ConfigError:
+            self._games.close()
+            raise
         shape: tuple[int, ...] = getattr(observed, "shape", None) or ()
         self.state_dim = shape[0] if len(shape) == 1 else 0
         set_specs(self, image_size, self.state_dim, torch.tensor(self._scale, device=self.device))
@@ -139,7 +144,7 @@ class GymnasiumPixels(EnvBase):
         if hasattr(space, "n") and hasattr(space, "start"):
             self._choices, self._start = int(space.n), int(space.start)
             self.action_dim, self._scale, self._middle = 1, np.ones(1, np.float32), np.zeros(1, np.float32)
-        elif hasattr(space, "low") and np.isfinite(space.low).all() and np.isfinite(space.high).all():
+        elif hasattr(space, "low") and (np.abs([space.low, space.high]) < _LARGE).all():
             self._action_shape, self._action_dtype = space.shape, space.dtype
             low, high = space.low.reshape(-1).astype(np.float32), space.high.reshape(-1).astype(np.float32)
             self.action_dim, self._scale, self._middle = len(low), (high - low) / 2, (high + low) / 2
@@ -163,7 +168,10 @@ class GymnasiumPixels(EnvBase):
             parts = (self._choices - 1) * repeat + 1
             lower, more = divmod(min(int((float(bounded[0]) + 1.0) / 2.0 * parts), parts - 1), repeat)
             return [self._start + lower + (step < more) for step in range(repeat)]
-        return [(self._middle + bounded).reshape(self._action_shape).astype(self._action_dtype)] * repeat
+        native = (self._middle + bounded).reshape(self._action_shape)
+        if np.issubdtype(self._action_dtype, np.integer):
+            native = np.rint(native)
+        return [native.astype(self._action_dtype)] * repeat
 
     def _options(self) -> dict[str, Any] | None:
         try:
@@ -207,6 +215,8 @@ class GymnasiumPixels(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict["action"].detach().cpu().reshape(-1, self.action_dim).numpy()
+        if np.isnan(actions).any():
+            raise NonFiniteError("action: expected finite numbers, received NaN; a policy gives them whose weights are not finite")
         previous, self._frame = self._frame, torch.empty_like(self._frame)
         self._last = self._games.ask("step", {k: (self._native_actions(row),) for k, row in enumerate(actions)})
         for k, moment in self._last.items():

@@ -197,13 +197,16 @@ def issue(path: str | Path, env: SafetyEnv | MakeEnv | None = None, **settings: 
         CheckpointError: if the agent cannot be read.
     """
     directory = agent_directory(path)
-    agent = Agent.load(directory)
+    agent, envs = Agent.load(directory), dict[str, Any]()
     try:
         before = Certificate.load(directory / CERTIFICATE_FILE)
-        settings = {"name": before.agent} | settings
+        same = {"level": before.level} if before.weights == weights_digest(agent.state_dict()) else {}
+        settings = {"name": before.agent} | same | settings
         if before.record is not None:
             kept = ("episodes", "horizon", "seed", "confidence", "acceptable")
-            settings = {k: getattr(before.record, k) for k in kept} | settings
+            used = {"used_seeds": before.record.used or ()}  # what was said to be used is used for ever
+            settings = {k: getattr(before.record, k) for k in kept} | used | settings
+            envs = {"envs": before.record.envs} if before.record.kind == "resets" else {}
     except CertificationError:
         settings = {"name": directory.parent.name if directory.name == "agent" else directory.name} | settings
     if env is None:
@@ -213,7 +216,7 @@ def issue(path: str | Path, env: SafetyEnv | MakeEnv | None = None, **settings: 
     if env is None or isinstance(env, SafetyEnv):
         certificate = certify(agent, env, **settings)
     else:
-        certificate = certify_on_episodes(agent, env, **settings)
+        certificate = certify_on_episodes(agent, env, **(envs | settings))
     certificate.save(directory / CERTIFICATE_FILE)
     return certificate
 

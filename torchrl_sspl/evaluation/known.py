@@ -21,7 +21,7 @@ from torchrl_sspl.evaluation.simulation import Episodes, simulate
 from torchrl_sspl.journal import kept_parts
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules.agent import Agent, on_host
-from torchrl_sspl.sets import Region
+from torchrl_sspl.sets import SAFE, UNSAFE, Region
 from torchrl_sspl.viability.grid import ViabilityKernel, recoverable_set, viability_kernel
 
 
@@ -193,9 +193,8 @@ def evaluate(
     _from_the_set(run)
     _from_unsafe(run)
     start = twin.sample_states(max(1, n // 5), generator=generator, region=twin.safe_set)
-    touched = twin.unsafe_set.contains(run.episodes(start, "S").states).any(0)
     note = f"episodes of {config.horizon} steps from S"
-    run.out.count("labelled_safe_rollouts_touch_unsafe", touched, note)
+    run.out.count("labelled_safe_rollouts_touch_unsafe", _touched(run.episodes(start, "S")), note)
     run.out.add(latency(acts, twin))
     return run.out
 
@@ -216,19 +215,19 @@ def _sets(run: _Run) -> Tensor | None:
         return None
     member, doomed = barrier <= 0, ~unsafe & ~viable
     on_grid = f"{sizes} states per dimension" if isinstance(sizes, int) else f"{_times(sizes)} states"
+    out.count(names[1], safe_barrier > 0, "uniform samples of S")
     for name, events, of, note in (
-        (names[1], safe_barrier > 0, None, "uniform samples of S"),
         (names[2], member & viable, viable, f"true kernel, {on_grid}"),
         (names[3], member & ~viable, member, f"{{B<=0}} outside the true kernel, {on_grid}"),
         (names[4], member & doomed, doomed, f"states outside U and the kernel, {on_grid}"),
     ):
-        out.count(name, events, note, of)
+        out.count(name, events, note, of, independent=False)
     note = "q1: largest B on S"
     out.add(Measurement("worst_safe_barrier", float(safe_barrier.max()), "barrier", len(safe_barrier), note=note))
     out.add(Measurement("barrier_depth", float(-barrier.min()), "barrier", note="|min B| on the grid"))
     out.arrays.update(barrier=barrier, **({} if latent is None else {"latent": latent}))
     in_unsafe, note = _unsafe_barrier(run, barrier[unsafe], on_grid)
-    out.count("unsafe_called_safe", in_unsafe <= 0, note)
+    out.count("unsafe_called_safe", in_unsafe <= 0, note, independent=False)
     worst = float(-in_unsafe.min())
     out.add(Measurement("worst_unsafe_barrier", worst, "barrier", len(in_unsafe), note="q2: largest -B on U"))
     return safe_barrier
@@ -277,12 +276,12 @@ def _margins(run: _Run, agent: Agent, safe_barrier: Any) -> None:
     note = "eta* = L_B delta, held-out steps of the policy"
     out.add(Measurement("dynamics_margin", eta, "barrier", len(error), note=note))
     q3 = agent.barrier(agent.dynamics(latent, agent.policy(latent)))[:, 0][barrier <= 0]
+    out.count("q1_with_margin", safe_barrier + psi <= 0, "B + psi* <= 0 on S")
     for name, met, what in (
-        ("q1_with_margin", safe_barrier + psi <= 0, "B + psi* <= 0 on S"),
         ("q2_with_margin", barrier[out.arrays["unsafe"]] - psi >= 0, "B - psi* >= 0 on U"),
         ("q3_with_margin", q3 + psi + eta <= 0, "B(d(z, pi(z))) + psi* + eta* <= 0 on {B<=0}"),
     ):
-        out.count(name, met, what)
+        out.count(name, met, f"{what}, on the grid", independent=False)
 
 
 def _step_errors(run: _Run, agent: Agent, start: Tensor, action: Tensor | None = None) -> Tensor:
@@ -310,22 +309,29 @@ def _from_the_set(run: _Run) -> None:
         return
     found = run.episodes(start, "{B<=0}")
     barrier = found.barrier
-    touched, left = env.unsafe_set.contains(found.states).any(0), (barrier > 0).any(0)
-    out.count("safe_rollouts_touch_unsafe", touched, note)
-    out.count("safe_rollouts_leave", left, note)
+    out.count("safe_rollouts_touch_unsafe", _touched(found), note)
+    out.count("safe_rollouts_leave", (barrier > 0).any(0), note)
+    stepped = found.alive[1:]
+    if env.exit_region == SAFE:  # nobody looks at whoever is gone
+        stepped = stepped & env.state_space.contains(found.states[1:])
     if run.agent is not None and run.agent.held_error > 0:  # of the memory it is proved; what is seen may lie outside
         out.count("safe_rollouts_seen_outside", (found.seen > 0).any(0), f"{note}, B > 0 for an observation by itself")
-        out.count("corrections_cut", found.cut[1:].flatten(), f"steps of {note}, correction that would leave the set")
+        out.count("corrections_cut", found.cut[1:] & stepped, f"steps of {note}, correction that would leave the set", stepped, independent=False)
     error, barrier_error = found.prediction_error, found.barrier_error
     if error is not None and barrier_error is not None:
         quantiles(out, "on_policy_error", error.amax(0), "latent", "largest error of an episode")
-        quantiles(out, "on_policy_step_error", error.flatten(), "latent", "error of a step")
+        quantiles(out, "on_policy_step_error", error[stepped], "latent", "error of a step")
         what = "largest B(E(o')) - B(d(z,u)) of an episode"
         quantiles(out, "barrier_error", barrier_error.amax(0), "barrier", what)
     next_one = barrier[1][barrier[0] <= 0]
     what = "R3: largest B after one step from {B<=0}"
     out.add(Measurement("worst_next_barrier", float(next_one.max()), "barrier", len(next_one), note=what))
     out.arrays.update(trajectories=found.states[:, :64], actions=found.actions[:, :64], traces=barrier[:, :64])
+
+
+def _touched(found: Episodes) -> Tensor:
+    """Which episodes ``(n,)`` enter U; where leaving the state space counts as that, by leaving it, too."""
+    return ((found.region == UNSAFE) & found.alive).any(0)
 
 
 def _from_unsafe(run: _Run) -> None:
@@ -348,7 +354,7 @@ def _from_unsafe(run: _Run) -> None:
     else:
         home = found.barrier[-1] <= 0
         out.arrays.update(recovery_traces=found.barrier[:, :32])
-    back = home & ~env.unsafe_set.contains(found.states[-1])
+    back = home & (found.region[-1] != UNSAFE)
     out.count(name, back, note)
     out.arrays.update(recovery=found.states[:, :32], recovery_actions=found.actions[:, :32])
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 from torch import Tensor
@@ -58,9 +58,13 @@ class Evaluation:
         """Keep a measurement under its name."""
         self.measurements[measurement.name] = measurement
 
-    def count(self, name: str, events: Tensor, note: str, of: Tensor | None = None) -> None:
-        """Keep the share of events ``(n,)`` bool in the trials, or in some of them, which hold all events."""
-        self.add(share(name, int(events.sum()), len(events) if of is None else int(of.sum()), note))
+    def count(self, name: str, events: Tensor, note: str, of: Tensor | None = None, *, independent: bool = True) -> None:
+        """Keep the share of events, bool, in the trials, or in some of them, which hold all events.
+
+        Nodes of a grid and steps of an episode are not ``independent``: their share has no bounds.
+        """
+        found = share(name, int(events.sum()), events.numel() if of is None else int(of.sum()), note)
+        self.add(found if independent else replace(found, lower=None, upper=None))
 
     def missing(self, *names: str, unit: str = "share", note: str = "no barrier") -> None:
         """Names of what could not be measured, and why."""

@@ -48,7 +48,7 @@ from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.trainers.hooks import MarginHook, RestartHook
 from torchrl_sspl.trainers.loggers import close_logger, log_figure, log_scalars, log_video, make_logger
-from torchrl_sspl.trainers.phases import Phase, Phases, Workspace
+from torchrl_sspl.trainers.phases import Phase, Phases, Workspace, action_grid
 from torchrl_sspl.trainers.selection import CheckRound, PlaceLevel
 from torchrl_sspl.trainers.source import Source, TrainingStarts
 from torchrl_sspl.trainers.synthesis import synthesis_phases
@@ -69,6 +69,10 @@ def agent_phases(config: Config, *, known: bool) -> list[Phase]:
         return []  # as printed
     phases = synthesis_phases(s, check=CheckRound if known else None) if s.enabled else []
     if e.calibrate and not known:
+        if e.episodes < 1:
+            raise ConfigError(
+                f"expected evaluation.episodes >= 1, whose pictures place the zero level, received {e.episodes}; evaluation.calibrate=false leaves it"
+            )
         number, progress = s.rounds - 1 if s.enabled else 0, config.trainer.progress
         phases.append(PlaceLevel(number, episodes=e.episodes, horizon=e.horizon, envs=e.envs, progress=progress))
     return phases
@@ -131,7 +135,8 @@ class Experiment:
         self.logger = make_logger(config.logger.kind, config.logger.kind, self.directory, project=config.logger.project)
         # An encoder without ``sequence`` reads observations; the store hands out views of its frames then.
         self.changes = Augmentation(**vars(config.augmentation), seed=config.seed) if config.augmentation.share else None
-        self.augmentation = None if config.synthesis.steady_steps else self.changes  # of the data
+        steadies = any(phase.name == "steady" for phase in agent_phases(config, known=self.known))
+        self.augmentation = None if steadies else self.changes  # of the data
         self.labels = Labels(**vars(config.labels), seed=config.seed) if config.labels != LabelsConfig() else None
         self.store = TransitionStore(
             config.buffer.capacity, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=self.augmentation, labels=self.labels
@@ -161,6 +166,13 @@ class Experiment:
                 f"expected actions with bounds, received {type(env.action_spec).__name__}; GymnasiumPixels makes such of discrete ones"
             )
         self._low, self._high = space.low.cpu().float(), space.high.cpu().float()
+        if not torch.allclose(self._low, -self._high) or not bool((self._high.isfinite() & (self._high > 0.0)).all()):
+            raise ConfigError(
+                f"expected actions between -a and a for some finite a > 0, received bounds {self._low.tolist()} and {self._high.tolist()}; move their "
+                "middle to zero in a transform of the environment, as GymnasiumPixels does"
+            )
+        if self.config.synthesis.enabled:
+            action_grid(self._high.flatten().tolist(), self.config.synthesis.choices or self.config.synthesis.actions)
         pixels = env.reset()["pixels"].cpu()
         if not isinstance(env, SafetyEnv):
             env.close()
@@ -168,7 +180,7 @@ class Experiment:
 
     def _networks(self) -> tuple[nn.Module, nn.Module, nn.Module, nn.Module]:
         net = self.config.network
-        scale = ((self._high - self._low) / 2).tolist()
+        scale = self._high.tolist()
         options = {"latent_dim": net.latent_dim, "pool_to": net.pool_to, "velocity_gain": net.velocity_gain}
         if self.known:
             options["image_size"] = self.env.image_size  # type: ignore[assignment]
@@ -433,10 +445,8 @@ class Experiment:
         return finish(self, outcome)
 
     def _budget(self) -> dict[str, int]:
-        source = self.work.source
-        if not source.budget["transitions"]:
-            source.count(self.store)
-        return dict(source.budget)
+        self.work.source.count_stored()
+        return dict(self.work.source.budget)
 
     def _warnings(self, evaluation: Evaluation) -> list[str]:
         lines = list(self.work.warnings)

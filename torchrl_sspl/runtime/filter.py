@@ -3,6 +3,7 @@ r"""The safety filter: any policy's actions, changed where the agent's set would
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -91,12 +92,17 @@ class Shield:
         self._first = compiled(self._judged) if compile else self._judged
         self._near = compiled(self._nearest) if compile else self._nearest
 
+    @cached_property
+    def proved(self) -> bool:
+        r"""Whether the agent's set is proved to be kept, and the margin is at least :math:`\eta`."""
+        return self.agent.tolerated_error > 0.0 and self.margin >= _proved_margin(self.agent)
+
     @torch.no_grad()
     def __call__(self, latent: Tensor, wanted: Tensor, own: Tensor | None = None) -> Protected:
         """Actions ``(n, m)`` in place of wanted ones ``(n, m)``, in physical units, at latents ``(n, p)``.
 
         What lies beyond the range is clipped. ``own``: the agent's own actions at these latents, where they are known already.
-        A ShapeError for another size, a NonFiniteError for NaN.
+        A ShapeError for another size, a NonFiniteError for NaN in actions or latents.
         """
         m = len(self.scale)
         for given in (wanted,) if own is None else (wanted, own):
@@ -104,6 +110,9 @@ class Shield:
                 raise ShapeError(f"expected actions of shape ({len(latent)}, {m}), received {tuple(given.shape)}")
         if not bool(wanted.isfinite().all()):
             raise NonFiniteError("expected finite actions, received NaN or infinity from the policy that is to be protected")
+        if not bool(latent.isfinite().all()):
+            raise NonFiniteError("latent: expected finite values, received NaN or infinity; an encoder gives those of finite weights alone")
+        wanted = wanted.to(latent.dtype)
         asked, own, taken, after_own, after, most, lost = self._first(latent, wanted, own)
         if bool(lost.any()):
             # A graph is for one number of rows.

@@ -135,7 +135,7 @@ class _Guard:
             raise ShapeError(f"expected pictures of {tuple(size)} pixels, received {shown}; resize them inside of this wrapper")
         self.statistics: dict[str, float] = {"steps": 0, "interventions": 0, "deviation": 0.0}
         self._type, self._controller = actions.dtype, Controller(agent, n, compile=bool(options.get("compile", False)))
-        self._held = agent.held_error > 0.0
+        self._held = agent.held_error > 0.0 and self.shield.proved
         self._latent: Tensor | None = None
 
     def begin(self, observation: NDArray[np.uint8]) -> dict[str, NDArray[Any]]:
@@ -149,7 +149,7 @@ class _Guard:
             self._controller.reset(torch.from_numpy(begins.nonzero()[0]))
         step = self._controller.step(_frames(np.asarray(observation), self._layout))
         self._latent = step.latent
-        applies = step.applies & self._held  # of a filter it is proved with held corrections alone
+        applies = step.applies & self._held  # of a filter it is proved with held corrections alone, and with the proved margin
         told = {"barrier": step.barrier, "inside": step.inside, "applies": applies}
         return {name: value.cpu().numpy() for name, value in told.items()}
 

@@ -217,8 +217,7 @@ class LogHook(_Hook):
         bad = {key: value for key, value in row.items() if key.startswith("loss") and not math.isfinite(value)}
         if bad:
             raise ConfigError(
-                f"expected finite losses, received {bad} after step {step}; lower optim.lr, or resume from the last checkpoint "
-                "with another seed"
+                f"expected finite losses, received {bad} after step {step}; lower optim.lr, or take another seed, in another out_dir"
             )
         if self.path is not None:
             append(self.path, json.dumps({"phase": "joint", "round": 0, "step": step, **row}))

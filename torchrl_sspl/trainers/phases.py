@@ -46,7 +46,7 @@ def action_grid(action_scale: Sequence[float], per_dimension: int) -> Tensor:
     if k**m > 8 * _MOST_ACTIONS:
         raise ConfigError(
             f"expected at most {int(math.log2(8 * _MOST_ACTIONS))} action dimensions, received {m}: a grid of actions is "
-            "tried at every latent; set synthesis.enabled=false to keep what the joint training has found"
+            "tried at every latent; with synthesis.enabled=false there is the joint training alone"
         )
     axes = [torch.linspace(-scale, scale, k) for scale in action_scale]
     return torch.cartesian_prod(*axes).reshape(-1, m)
@@ -114,8 +114,8 @@ class InnerLoop:
                 row = {k: float(v.detach()) for k, v in terms.items()}
                 if not all(map(math.isfinite, row.values())):
                     raise ConfigError(
-                        f"expected finite losses, received {row} in step {self.step}; lower the learning rate, or resume "
-                        "from the last checkpoint with another seed"
+                        f"expected finite losses, received {row} in step {self.step}; lower synthesis.lr, or take another "
+                        "seed, in another out_dir"
                     )
                 self.loss = sum(v for k, v in row.items() if k.startswith("loss"))
                 self.log({"step": self.step, **row})
@@ -452,7 +452,7 @@ class Phases(TrainerHookBase):
             if not work.skip:
                 if work.loop.step == 0:  # what a phase computes first still counts when its steps have moved the weights
                     self.weights = [weights_digest(net.state_dict()) for net in (work.encoder, work.networks)]
-                with journal(work.out_dir, f"{phase.name}-{phase.number}", *self.weights):
+                with journal(work.out_dir, f"{phase.name}-{phase.number}", *self.weights, beat=self.bar.beat):
                     phase.run(work)
             work.loop.restart()
             self.done += 1

@@ -83,6 +83,12 @@ class Progress:
         self._seen = transitions
         self.show()
 
+    def beat(self) -> None:
+        """Something goes on: the clock does, too."""
+        if self.shown and time.monotonic() - self._looked >= _EVERY:
+            self._looked = time.monotonic()
+            self._bar.refresh()
+
     def show(self, loss: float | None = None) -> None:
         """Loss, volume and time left."""
         parts = [self._note] if self._note else []

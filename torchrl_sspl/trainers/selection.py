@@ -193,6 +193,7 @@ class PlaceLevel(Phase):
         self.episodes, self.horizon, self.envs, self.progress = episodes, horizon, envs, progress
 
     def run(self, work: Workspace) -> None:
+        work.source.count_stored()  # a run that goes on after this phase has no pictures any more
         work.level = self.place(work)
         work.log({"step": self.number, "level": work.level})
 

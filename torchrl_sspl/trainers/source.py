@@ -115,6 +115,11 @@ class Source:
         self.budget["resets"] += (store.n_frames - n) // 2  # an episode has two frames more than transitions
         self.tell(self.budget["transitions"])
 
+    def count_stored(self) -> None:
+        """Adds what the joint training has collected, unless anything was counted before."""
+        if self.store is not None and not self.budget["transitions"]:
+            self.count(self.store)
+
     def count_labels(self, answers: Tensor) -> None:
         """Adds labels ``(n,)`` that were asked for to the budget, with those that say that a picture is of neither set."""
         for code, name in ((SAFE, "labels of S"), (UNSAFE, "labels of U"), (UNLABELLED, "labels of neither")):

@@ -64,9 +64,10 @@ class Gather(Phase):
     """Encoded transitions: those of the joint training and random actions in the first round, the policy's own afterwards.
 
     A memory drifts along the paths that a policy takes, not along random ones: behind an observer the first round adds
-    episodes of the policy of the joint training, too. Where the environment knows its sets, further rounds add transitions of the exploring policy that start in the set
-    or near it, and of many that start in U those whose pictures the present barrier puts lowest: the rim of U is where
-    a set goes wrong first. Elsewhere they add episodes of the exploring policy from the environment's own resets.
+    episodes of the policy as the joint training leaves it, too. Where the environment knows its sets, further rounds add
+    transitions of the exploring policy that start in the set or near it, and of many that start in U those whose pictures the
+    present barrier puts lowest: the rim of U is where a set goes wrong first. Elsewhere they add episodes of the exploring
+    policy from the environment's own resets.
     Source: paper Algorithm 1 (rollouts join D); deviation: which of them are kept is decided by their pictures.
     """
 

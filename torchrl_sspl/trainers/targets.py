@@ -222,7 +222,8 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     box: dict[str, Any] = {"low": low, "high": [-v for v in low], "resolution": sizes, "period": period}
 
     def kernel() -> dict[str, Any]:
-        computed = viability_kernel(step, exit_is_safe=False, **box, **system)
+        with journal(None, "kernel"):  # its own sweeps are numbered apart: when they are done nobody asks for them
+            computed = viability_kernel(step, exit_is_safe=False, **box, **system)
         return {k: v for k, v in vars(computed).items() if k != "grid"}
 
     found = ViabilityKernel(grid=Grid(**box), **kept(kernel))

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError, NonFiniteError, ShapeError
+from torchrl_sspl.journal import Entry
 from torchrl_sspl.sets import UNSAFE, Box, Difference, Region, Union
 
 Dynamics = Callable[[Tensor, Tensor], Tensor]
@@ -236,11 +237,22 @@ def _iterate(
     limit: int,
 ) -> ViabilityKernel:
     """Combines the values with the best among their successors' until they stay as they are."""
-    start, iterations, change = time.perf_counter(), 0, math.inf
+    entry = Entry("sweeps", value, tolerance, limit)
+    state = entry.saved() or {"value": value, "iterations": 0, "change": math.inf, "seconds": 0.0}
+    value, iterations, change = state["value"], state["iterations"], state["change"]
+    start = time.perf_counter() - state["seconds"]
+
+    def save(complete: bool = False) -> None:
+        state = {"value": value, "iterations": iterations, "change": change, "seconds": time.perf_counter() - start}
+        entry.save(state, complete=complete)
+
     while change > tolerance and iterations < limit:
         new = combine(value, problem.best_successor(value, cut))
         change = float((new - value).abs().max()) / cut
         value, iterations = new, iterations + 1
+        if entry.due:
+            save()
+    save(complete=True)
     grid, seconds = problem.grid, time.perf_counter() - start
     value, margin = value.reshape(grid.shape), problem.margin.reshape(grid.shape)
     return ViabilityKernel(value, margin, grid, problem.exit_is_safe, iterations, seconds, change)

@@ -127,7 +127,7 @@ def _row(
     asked = worst if len(known) == len(values) else None
     verdict = required.verdict(SimpleNamespace(measurements={name: SimpleNamespace(value=asked)}))
     for m in found:  # of equal values the least certain counts
-        verdict = bounded(required, verdict, SimpleNamespace(**{k: m.get(k) for k in ("lower", "upper")}))
+        verdict = bounded(required, verdict, SimpleNamespace(**{k: m.get(k) for k in ("lower", "upper", "unit")}))
     must, label = f"{required.sense} {format_value(required.must, unit)}", required.label + shown
     return Row(setting, evaluation, name, label, unit, must, mean, worst, values, verdict_in(unit, verdict))
 

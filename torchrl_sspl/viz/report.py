@@ -143,7 +143,8 @@ def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple
 def bounded(requirement: Any, verdict: str, measurement: Any) -> str:
     """A verdict "aim" or "must" stands where the 95 % bound of the measurement reaches the must too.
 
-    Else it is "none seen" (or "all seen") of what no bound of a sample can reach, and "too few episodes" of the rest.
+    Else it is "none seen" (or "all seen") of what no bound of a sample can reach, and "too few episodes" of the rest. Nodes of a
+    grid are no sample: without a bound a verdict stands, but that none of some nodes is a fault says nothing of what lies between.
 
     Example:
         >>> from types import SimpleNamespace
@@ -154,9 +155,12 @@ def bounded(requirement: Any, verdict: str, measurement: Any) -> str:
     """
     upward = requirement.sense == "<="
     bound = getattr(measurement, "upper" if upward else "lower", None)
-    if bound is None or math.isnan(bound) or not verdict.startswith(("aim", "must")):
+    if not verdict.startswith(("aim", "must")):
         return verdict
-    if (bound <= requirement.must) if upward else (bound >= requirement.must):
+    if bound is None or math.isnan(bound):
+        if getattr(measurement, "unit", "") != "share" or requirement.must != (0.0 if upward else 1.0):
+            return verdict
+    elif (bound <= requirement.must) if upward else (bound >= requirement.must):
         return verdict
     if requirement.must == (0.0 if upward else 1.0):
         return "none seen" if upward else "all seen"
@@ -259,10 +263,9 @@ def _measured_lines(rows: Sequence[Sequence[Any]], measurements: Mapping[str, di
     order, lines = ("bad", "fair", "good", "none"), []
     for label, value, _, _, verdict in rows:
         _, m = _resolve(label, value, measurements)
-        if m.get("n") and m.get("upper") is not None:
-            kind = verdict_kind(verdict)
-            shown = format_value(m.get("value"), "share")
-            lines.append((kind, f"{label}: {shown} of {m['n']:,} (95 %: {_bound(m)})"))
+        if m.get("n") and m.get("unit") == "share" and m.get("value") is not None:
+            shown, bound = format_value(m["value"], "share"), _bound(m)
+            lines.append((verdict_kind(verdict), f"{label}: {shown} of {m['n']:,}" + (f" (95 %: {bound})" if bound != "\u2013" else "")))
     return sorted(lines, key=lambda item: order.index(item[0]))
 
 

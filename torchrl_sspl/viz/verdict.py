@@ -151,7 +151,7 @@ def _of_run(rows: Sequence[Sequence[Any]], kinds: Sequence[str]) -> list[str]:
     said = []
     harm = {getattr(row[1], "name", ""): row for row in rows if _line(row)}
     for name in _HARM:
-        if name in harm:
+        if name in harm and harm[name][1].upper is not None:
             label, m = harm[name][0], harm[name][1]
             said.append(f"In this run, {label}: {m.events or 'none'} of {m.n:,} (at most {up(100 * m.upper, 3)} %)")
             break
@@ -167,14 +167,15 @@ def _of_run(rows: Sequence[Sequence[Any]], kinds: Sequence[str]) -> list[str]:
 def _line(row: Sequence[Any]) -> str:
     """A row as a sentence, "" where nothing was measured or no share was."""
     label, m, must = row[0], row[1], row[2]
-    if getattr(m, "value", None) is None or not getattr(m, "n", None) or getattr(m, "upper", None) is None:
+    if getattr(m, "value", None) is None or not getattr(m, "n", None) or getattr(m, "events", None) is None:
         return ""
-    bound = f"at most {up(100 * m.upper, 3)} %"
-    if m.events != 0:
-        low = f"{down(100 * m.lower, 3)} %"
-        bound = f"at least {low}" if m.events == m.n else f"{low} to {up(100 * m.upper, 3)} %"
+    bound = ""
+    if m.upper is not None:
+        low, high = f"{down(100 * m.lower, 3)} %", f"{up(100 * m.upper, 3)} %"
+        among = f"at least {low}" if m.events == m.n else f"{low} to {high}"
+        bound = f"95 %: {among if m.events else f'at most {high}'}; "
     count = "none" if m.events == 0 else "all" if m.events == m.n else format_value(m.value, "share")
-    return f"{label[:1].upper()}{label[1:]}: {count} of {m.n:,} (95 %: {bound}; must be {must})."
+    return f"{label[:1].upper()}{label[1:]}: {count} of {m.n:,} ({bound}must be {must})."
 
 
 def _proofs(layer: Layer) -> list[Item]:
