@@ -124,7 +124,11 @@ def test_the_level_is_the_highest_that_passes():
     lower = judged(held_out(unsafe=values(8, usual=0.5, one=-0.02)))
     assert lower.checks[0].level == pytest.approx(-0.045, abs=1e-6)
     # Farther down the condition that was trained says nothing: with a margin of 0.1 the level stays above -0.06.
-    assert not judged(held_out(unsafe=values(8, usual=0.5, one=-0.1))).checks[0].passed
+    low = held_out(unsafe=values(8, usual=0.5, one=-0.1))
+    assert not judged(low).checks[0].passed
+    allowed = judged(low, workspace(replace(CONFIG, lowest_level=-0.2))).checks[0]  # where episodes are to tell
+    assert allowed.passed
+    assert allowed.level == pytest.approx(-0.125, abs=1e-6)
 
 
 def test_where_no_level_passes_the_reason_is_that_of_zero_and_nothing_is_kept():

@@ -242,6 +242,8 @@ class SynthesisConfig:
         "(which targets on a grid leave out).")
     guard: float = _option(0.02, "distance that held-out observations of U keep from the zero level (units of the "
         "barrier).")
+    lowest_level: float | None = _option(None, "lowest level to which the checks of a round may move the set, at least -0.2; null: -0.6 margin, below which "
+        "the trained condition says nothing of a level. Few labels need a lower one: episodes have to tell then whether it is kept.")
     leave_share: float = _option(0.00075, "largest share of the held-out episodes of a round that may leave the set; "
         "none may touch U.")
     safe_share: float = _option(0.0, "share of the held-out pictures of S that may lie outside the set, where noise makes all of S too "
@@ -370,6 +372,8 @@ class Config:
                 f"expected synthesis.grid=0, or at least 3 nodes and synthesis.teacher=value, whose policy the targets on a grid take "
                 f"over, received grid={s.grid} and teacher={s.teacher}"
             )
+        if s.lowest_level is not None and not -0.2 <= s.lowest_level <= 0.0:
+            raise ConfigError(f"expected synthesis.lowest_level between -0.2 and 0, or null, received {s.lowest_level}")
         if s.rounds > 1 and s.rollout_transitions < 1:
             raise ConfigError(f"expected synthesis.rollout_transitions >= 1 with synthesis.rounds={s.rounds}, received {s.rollout_transitions}")
         return self

@@ -79,7 +79,10 @@ class CheckRound(Phase):
             found = Check(self.number, 0.0, 0, 0, 0, 0, 0.0, 0.0, False, "the set is empty")
         else:
             levels = torch.linspace(_LOWEST_LEVEL, _HIGHEST_LEVEL, 57).flip(0).tolist()
-            lowest = -_MOST_OF_MARGIN * work.config.margin - 1e-6  # below it the condition says nothing of the level
+            lowest = work.config.lowest_level
+            if lowest is None:
+                lowest = -_MOST_OF_MARGIN * work.config.margin  # below it the condition says nothing of the level
+            lowest -= 1e-6
             checks = (self._check(work, held_out, level) for level in levels if level >= lowest)
             found = next((c for c in checks if c.passed), None) or self._check(work, held_out, 0.0)
             if work.config.cover_share > 0:
