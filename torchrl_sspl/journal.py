@@ -114,6 +114,11 @@ class Entry:
         return None
 
     @property
+    def open(self) -> bool:
+        """Whether there is a journal that keeps what is saved."""
+        return self._path is not None
+
+    @property
     def due(self) -> bool:
         """Whether it is time to save what is not complete, or somebody waits for that; asked with every piece of it."""
         self._beat()

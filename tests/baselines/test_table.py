@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from torchrl_sspl.baselines.__main__ import main
-from torchrl_sspl.baselines.cell import ROW_FILE
+from torchrl_sspl.baselines.cell import ROW_FILE, Cell, run_cell
+from torchrl_sspl.baselines.page import claims
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.baselines.table import DEFAULTS, TICKS, cells, markdown, table
 from torchrl_sspl.errors import ConfigError
@@ -34,7 +37,7 @@ def test_options_of_a_method_may_hold_commas():
 def test_the_table_runs_what_is_missing_and_only_that(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     words = ["methods=lqr,cone", "env=pendulum", *SMALL]
-    text = table(["run=false", *words])
+    text = markdown(table(["run=false", *words]))
     assert text.count("not measured") == 2
     assert main(["table", *words]) == 0
     text = capsys.readouterr().out
@@ -42,11 +45,43 @@ def test_the_table_runs_what_is_missing_and_only_that(tmp_path, monkeypatch, cap
     assert "expected a DubinsEnv" in text  # a cell that fails is named, the other stands
     path = tmp_path / "runs/baselines/pendulum/none/lqr/0" / ROW_FILE
     before = path.stat().st_mtime_ns
-    assert "not measured" in table(["run=false", *words])
+    assert "not measured" in markdown(table(["run=false", *words]))
     assert main(["table", *words]) == 0
     assert path.stat().st_mtime_ns == before
     assert (tmp_path / "runs/baselines/table.md").is_file()
-    assert "not measured" not in table(["run=false", "methods=lqr", "env=pendulum"])  # measured with other sizes, and said so
+    html = (tmp_path / "runs/baselines/table.html").read_text()
+    assert html.count("<h3>") == 2  # measured, and given
+    assert html.count("data:image/png") == 1
+    assert "expected a DubinsEnv" in html
+    (axes,) = [ax for ax in claims(cells(words)).axes if ax.images]
+    colours = {tuple(c) for c in axes.images[0].get_array().reshape(-1, 3).tolist()}
+    assert {(76, 159, 112), (207, 214, 228), (255, 255, 255)} <= colours  # claimed, the rest of the kernel, outside
+    assert "not measured" not in markdown(table(["run=false", "methods=lqr", "env=pendulum"]))  # measured with other sizes, and said so
+
+
+def test_cells_side_by_side_are_those_one_after_the_other(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    words = ["methods=lqr,hocbf,cone", "env=pendulum", *SMALL]
+    rows = table(["jobs=2", *words])
+    assert [cell.method for cell, _ in rows] == ["lqr", "hocbf", "cone"]
+    assert "expected a DubinsEnv" in rows[2][1]
+    for cell, row in rows[:2]:
+        alone = run_cell(replace(cell, out_dir=f"alone/{cell.method}"))
+        assert {n: m["value"] for n, m in row["measurements"].items() if "latency" not in n} == {
+            n: m["value"] for n, m in alone["measurements"].items() if "latency" not in n
+        }
+    with pytest.raises(ConfigError, match="jobs >= 1, received run=true and jobs=0"):
+        table(["jobs=0", *words])
+
+
+def test_a_car_is_shown_at_its_middle_heading(tmp_path):
+    cell = Cell.of("cone", ["env=dubins", f"out_dir={tmp_path}", "score.grid=9", *SMALL[:2], *SMALL[3:]])
+    run_cell(cell)
+    figure = claims([cell, replace(cell, out_dir="nowhere")])
+    (axes,) = [ax for ax in figure.axes if ax.images]
+    assert axes.images[0].get_array().shape == (9, 9, 3)
+    assert axes.get_title() == "cone\nnone, seed 0"
+    assert claims([replace(cell, out_dir="nowhere")]) is None
 
 
 def test_several_seeds_are_a_mean_and_the_worst():

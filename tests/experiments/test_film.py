@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -9,6 +10,7 @@ import torchrl_sspl as sspl
 from torchrl_sspl.envs import DubinsEnv, Opening, PendulumEnv
 from torchrl_sspl.evaluation.known import barrier_of
 from torchrl_sspl.experiments.film import Film
+from torchrl_sspl.journal import journal
 
 
 def kinds(take):
@@ -69,6 +71,31 @@ def test_every_walk_of_the_film_enters_u_without_protection_and_goes_on_for_eigh
     assert protected.name == "behind the safety filter"
     assert set(protected.said) == {("inside: the proof applies", "good")}
     assert len(protected.said) == round(8.0 / env.dt) + 1
+
+
+def test_pictures_that_an_interrupted_report_has_drawn_are_not_drawn_again(tmp_path, monkeypatch):
+    monkeypatch.setattr("torchrl_sspl.journal._SHORT", 0.0)
+    drawn = []
+
+    class Stage:
+        def follow(self, bodies, dt):
+            for body in bodies:
+                drawn.append(body)
+                yield np.full((4, 4, 3), body, np.uint8)
+
+    film = Film(sspl.load("pendulum"), PendulumEnv(seed=0))
+    film.__dict__["_stage"] = Stage()
+    with pytest.raises(KeyboardInterrupt), journal(tmp_path, "run"):
+        first = [*film._drawn([1, 2, 3], "alone", torch.zeros(1))]
+        next(film._drawn([4, 5], "behind the filter", torch.zeros(1)))
+        raise KeyboardInterrupt
+    drawn.clear()
+    with journal(tmp_path, "run"):
+        again = [*film._drawn([1, 2, 3], "alone", torch.zeros(1))]
+        rest = [*film._drawn([4, 5], "behind the filter", torch.zeros(1))]
+    assert np.array_equal(first, again)
+    assert len(rest) == 2
+    assert drawn == [4, 5]
 
 
 @pytest.mark.pybullet

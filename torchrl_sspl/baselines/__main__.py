@@ -14,9 +14,9 @@ _USAGE = """python -m torchrl_sspl.baselines METHOD [env=pendulum|dubins] [budge
 Fits a method, measures it and prints the row; score.episodes=... and the like are sizes of the measurement. What has been
 measured is read again, not measured again.
 
-python -m torchrl_sspl.baselines table [methods=NAME,NAME:key=value] [env=pendulum,dubins] [budget=small] [seed=0,1,2] [trials=8] [run=false]
+python -m torchrl_sspl.baselines table [methods=NAME,NAME:key=value] [env=pendulum,dubins] [budget=small] [seed=0,1,2] [trials=8] [run=false] [jobs=2]
 
-Runs the cells that are missing and writes runs/baselines/table.md. METHOD is one of:
+Runs the cells that are missing, as many at a time as jobs, and writes runs/baselines/table.md and table.html. METHOD is one of:
 """
 
 
@@ -29,9 +29,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0 if words else 2
     try:
         if words[0] == "table":
-            from torchrl_sspl.baselines import table
+            from torchrl_sspl.baselines import page
 
-            return table.main(words[1:])
+            return page.main(words[1:])
         print(text(run_cell(Cell.of(words[0], words[1:]))))
     except SSPLError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)

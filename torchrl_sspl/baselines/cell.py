@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import io
 import json
 import tempfile
 import time
@@ -12,6 +13,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -30,7 +32,7 @@ from torchrl_sspl.modules.agent import WEIGHTS_FILE, agent_directory
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
-ROW_FILE, TRIALS_FILE = "row.json", "trials.json"
+ROW_FILE, CLAIMS_FILE, TRIALS_FILE = "row.json", "claims.npz", "trials.json"
 SCHEMA = 1
 _OWN = ("env", "budget", "seed", "out_dir", "trials")
 
@@ -233,6 +235,11 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         }  # fmt: skip
         if cell.trials:
             row["tuning"] = {"chosen": list(chosen), "trials": trials}
+        claims = found.arrays
+        if "barrier" in claims:
+            packed = io.BytesIO()
+            np.savez_compressed(packed, states=claims["states"], claimed=claims["barrier"] <= 0.0, viable=claims["viable"])
+            write(directory / CLAIMS_FILE, packed.getvalue())
         write(directory / ROW_FILE, json.dumps(row, indent=1) + "\n")
         return row
 

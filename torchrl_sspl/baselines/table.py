@@ -1,11 +1,13 @@
-"""The table of the comparison: runs the cells that are missing, one after the other, and writes it in Markdown."""
+"""The table of the comparison: the cells that are missing are measured, and all of them are lines of Markdown."""
 
 from __future__ import annotations
 
 import itertools
-import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +15,8 @@ from torchrl_sspl.baselines.cell import Cell, run_cell, stored
 from torchrl_sspl.baselines.registry import kind_of
 from torchrl_sspl.configs.reader import parse
 from torchrl_sspl.errors import ConfigError, SSPLError
-from torchrl_sspl.files import write
+
+Row = dict[str, Any] | str  # what was measured, or why nothing was
 
 #: The paper's Table I: requires a model, general dynamics, expert demonstrations, computationally expensive, safety and completeness guarantees.
 TICKS = {
@@ -98,59 +101,95 @@ def _names(text: str) -> list[str]:
     return names
 
 
-def table(words: Sequence[str]) -> str:
-    """Runs the cells that are missing and returns the table; ``run=false`` only reads what is there, whatever its sizes.
+def table(words: Sequence[str]) -> list[tuple[Cell, Row]]:
+    """Measures the cells that are missing and returns all rows; ``run=false`` only reads what is there, whatever its sizes.
 
-    A cell that fails is named in its row; the others go on. Source: none.
+    With ``jobs=2`` two processes measure side by side. A cell that fails is named in its row; the others go on. Source: none.
     """
-    run = "run=false" not in words
-    asked = cells([w for w in words if w not in ("run=false", "run=true")])
-    rows: dict[Path, dict[str, Any] | str] = {}
-    for k, cell in enumerate(asked):
-        try:
-            row = run_cell(cell) if run else stored(cell, any_score=True)
-            rows[cell.directory] = row if row is not None else "not measured"
-        except SSPLError as error:
-            rows[cell.directory] = f"{type(error).__name__}: {error}"
-        print(f"{k + 1} of {len(asked)}: {cell.directory}", file=sys.stderr, flush=True)
-    return markdown([(cell, rows[cell.directory]) for cell in asked])
+    given, own = parse(list(words)), {}
+    for name in ("run", "jobs"):
+        own[name] = given.pop(name, {"run": "true", "jobs": "1"}[name])
+    if own["run"] not in ("true", "false") or not own["jobs"].isdigit() or not int(own["jobs"]):
+        raise ConfigError(f"table: expected run=true or false and jobs >= 1, received run={own['run']} and jobs={own['jobs']}")
+    asked, jobs = cells([f"{k}={v}" for k, v in given.items()]), int(own["jobs"])
+    measure = _row if own["run"] == "true" else _stored_row
+    found: dict[Path, Row] = {}
+    with ExitStack() as stack:
+        rows: Iterable[Row] = map(measure, asked)
+        if jobs > 1 and own["run"] == "true":
+            pool = stack.enter_context(ProcessPoolExecutor(jobs, get_context("spawn")))
+            rows = pool.map(measure, asked)
+        for cell, row in zip(asked, rows, strict=True):
+            found[cell.directory] = row
+            print(f"{len(found)} of {len(asked)}: {cell.directory}", file=sys.stderr, flush=True)
+    return [(cell, found[cell.directory]) for cell in asked]
 
 
-def markdown(rows: Sequence[tuple[Cell, dict[str, Any] | str]]) -> str:
-    """Three tables for each system: what was measured, on shifted pictures too, and what each method was given. Source: none."""
-    text = []
+def _row(cell: Cell) -> Row:
+    try:
+        return run_cell(cell)
+    except SSPLError as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def _stored_row(cell: Cell) -> Row:
+    try:
+        return stored(cell, any_score=True) or "not measured"
+    except SSPLError as error:
+        return f"{type(error).__name__}: {error}"
+
+
+def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[list[str]]]]]:
+    """Tables by system: what was measured, what each method was given, and what is claimed on shifted pictures; each has a title
+    and lines, of which the first is its head. Source: none."""
+    every = {}
     for env, group in itertools.groupby(sorted(rows, key=lambda r: r[0].env), key=lambda r: r[0].env):
-        several: dict[tuple[str, str], list[dict[str, Any] | str]] = {}
+        several: dict[tuple[str, str], list[Row]] = {}
         for cell, row in group:
-            label = " ".join([cell.method, *cell.options, *([f"trials={cell.trials}"] if cell.trials else [])])
-            trained = any(option.startswith("agent=") for option in cell.options)
-            several.setdefault((label, "its own" if trained else cell.budget), []).append(row)
-        head = ["method", "budget", *(c[0] for c in _MEASURED), "latency p50 / p99", "episodes"]
-        lines = [_line(head), _line(["---"] * len(head))]
-        needs = ["method", "budget", *(c[0] for c in _NEEDED), "training, CPU min", "proved", "paper: " + ", ".join(_TICK_NAMES)]
-        given = [_line(needs), _line(["---"] * len(needs))]
-        moved = ["method", "budget", *_SHIFTS]
-        shifted = [_line(moved), _line(["---"] * len(moved))]
+            several.setdefault((name_of(cell), budget_of(cell)), []).append(row)
+        lines = [["method", "budget", *(c[0] for c in _MEASURED), "latency p50 / p99", "episodes"]]
+        given = [["method", "budget", *(c[0] for c in _NEEDED), "training, CPU min", "proved", "paper: " + ", ".join(_TICK_NAMES)]]
+        shifted = [["method", "budget", *_SHIFTS]]
         for (label, budget), found in several.items():
             good = [row for row in found if isinstance(row, dict)]
             if not good:
-                lines.append(_line([label, budget, str(found[0]), *[""] * (len(head) - 3)]))
+                lines.append([label, budget, str(found[0]), *[""] * (len(lines[0]) - 3)])
                 continue
             first = good[0]
             if len(good) < len(found):
                 reason = next(str(row) for row in found if not isinstance(row, dict))
                 label = f"{label} ({len(good)} of {len(found)} seeds; {reason})"
             episodes = str(first["measurements"].get("common_harmless_enter", {}).get("n"))
-            lines.append(_line([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes]))
+            lines.append([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes])
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
-                shifted.append(_line([label, budget, *(" / ".join(_value(good, _moved(c, shift)) for c in _MEASURED[:3]) for shift in _SHIFTS)]))
+                shifted.append([label, budget, *(" / ".join(_value(good, _moved(c, shift)) for c in _MEASURED[:3]) for shift in _SHIFTS)])
             facts = [str(first["needs"][key]) for _, key in _NEEDED]
             minutes = sum(row["minutes"]["fit_cpu"] for row in good) / len(good)
             ticks = TICKS.get(first["cell"]["method"], "")
-            given.append(_line([label, budget, *facts, f"{minutes:.1f}", first["needs"]["proved"], " ".join("✓" if t == "+" else "✗" for t in ticks) or "-"]))
-        text += [f"### {env}", "", *lines, "", *given, ""]
-        if len(shifted) > 2:
-            text += ["Shifted pictures: claimed / kernel, false-safe, U called safe", "", *shifted, ""]
+            given.append([label, budget, *facts, f"{minutes:.1f}", first["needs"]["proved"], " ".join("✓" if t == "+" else "✗" for t in ticks) or "-"])
+        every[env] = [("Measured", lines), ("Given", given)]
+        if len(shifted) > 1:
+            every[env].append(("Shifted pictures: claimed / kernel, false-safe, U called safe", shifted))
+    return every
+
+
+def name_of(cell: Cell) -> str:
+    """The method of a cell with its options. Source: none."""
+    return " ".join([cell.method, *cell.options, *([f"trials={cell.trials}"] if cell.trials else [])])
+
+
+def budget_of(cell: Cell) -> str:
+    """The budget of a cell; an agent that was trained before has one of its own. Source: none."""
+    return "its own" if any(option.startswith("agent=") for option in cell.options) else cell.budget
+
+
+def markdown(rows: Sequence[tuple[Cell, Row]]) -> str:
+    """The tables in Markdown. Source: none."""
+    text = []
+    for env, found in tables(rows).items():
+        text += [f"### {env}", ""]
+        for title, (head, *lines) in found:
+            text += [f"{title}:", "", _line(head), _line(["---"] * len(head)), *map(_line, lines), ""]
     return "\n".join(text)
 
 
@@ -184,14 +223,4 @@ def _latency(rows: list[dict[str, Any]]) -> str:
     return f"{p50:.1f} / {p99:.1f} ms"
 
 
-def main(words: Sequence[str]) -> int:
-    """Print the table and write it, with all rows, beside the runs; 0. Source: none."""
-    text = table(words)
-    print(text)
-    write("runs/baselines/table.md", text)
-    found = sorted(Path("runs/baselines").rglob("row.json"))
-    write("runs/baselines/rows.json", json.dumps([json.loads(p.read_text()) for p in found], indent=1) + "\n")
-    return 0
-
-
-__all__ = ["DEFAULTS", "TICKS", "cells", "markdown", "table"]
+__all__ = ["DEFAULTS", "TICKS", "Row", "budget_of", "cells", "markdown", "name_of", "table", "tables"]

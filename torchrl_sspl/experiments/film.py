@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import functools
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv
@@ -15,6 +18,7 @@ from torchrl_sspl.envs.system import Opening
 from torchrl_sspl.evaluation.controllers import AgentController, Camera, Decision
 from torchrl_sspl.evaluation.known import barrier_of
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.journal import Entry
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.modules.controller import meets_premise
 from torchrl_sspl.runtime import Shield
@@ -132,8 +136,18 @@ class Film:
         poses = [[*bodies[i].position[:2], bodies[i].roll_pitch_yaw[2]] for i in moments]
         shown = episodes.frames[step, 0].permute(0, 2, 3, 1)
         values = None if episodes.barrier is None else episodes.barrier[step, 0]
-        pictures = self._stage.follow([bodies[i] for i in moments], 1 / self.fps)
-        return Take(name, pictures, [said[t] for t in step], torch.tensor(poses), values, shown)
+        where = torch.tensor(poses)
+        pictures = self._drawn([bodies[i] for i in moments], name, where)
+        return Take(name, pictures, [said[t] for t in step], where, values, shown)
+
+    def _drawn(self, bodies: list[Any], *about: Any) -> Iterator[NDArray[np.uint8]]:
+        """Pictures of a robot, drawn while what follows is simulated; those that an interrupted report has drawn are in its journal."""
+        entry = Entry("pictures", *about)
+        saved = entry.saved()
+        if saved is not None:
+            content = np.frombuffer(zlib.decompress(saved["content"].numpy().tobytes()), np.uint8)
+            return iter(content.reshape(saved["shape"]))
+        return _kept(self._stage.follow(bodies, 1 / self.fps), entry)
 
     def _said(self, episodes: Episodes, recorder: _Recorder | None, ends: bool) -> list[tuple[str, str]]:
         """What is known at every step: what the true state says, or else B.
@@ -169,6 +183,19 @@ class Film:
             met = meets_premise(self.agent, barrier[:n, 0], seen[:n, 0], torch.zeros(n))
             applies = met.cumprod(0).bool()
         return [_PROVED if p else _INSIDE if i else _OUTSIDE for p, i in zip(applies.tolist(), inside.tolist(), strict=True)]
+
+
+def _kept(pictures: Iterator[NDArray[np.uint8]], entry: Entry) -> Iterator[NDArray[np.uint8]]:
+    """The same pictures, which are saved behind the last."""
+    shown = []
+    for picture in pictures:
+        yield picture
+        if entry.open:
+            shown.append(picture)
+    if shown:
+        content = zlib.compress(np.stack(shown).tobytes(), 1)
+        saved = {"shape": [len(shown), *shown[0].shape], "content": torch.frombuffer(bytearray(content), dtype=torch.uint8)}
+        entry.save(saved, complete=True)
 
 
 def take_of(
