@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 import pytest
 import torch
@@ -85,7 +87,7 @@ def test_pictures_that_an_interrupted_report_has_drawn_are_not_drawn_again(tmp_p
 
     film = Film(sspl.load("pendulum"), PendulumEnv(seed=0))
     film.__dict__["_stage"] = Stage()
-    with pytest.raises(KeyboardInterrupt), journal(tmp_path, "run"):
+    with suppress(KeyboardInterrupt), journal(tmp_path, "run"):
         first = [*film._drawn([1, 2, 3], "alone", torch.zeros(1))]
         next(film._drawn([4, 5], "behind the filter", torch.zeros(1)))
         raise KeyboardInterrupt
