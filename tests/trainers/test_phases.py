@@ -194,7 +194,7 @@ def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_pat
         def forward(self, latent, action):
             return (latent + 0.2 * action).clamp(-1, 1)
 
-    work = experiment(tmp_path, "synthesis.choices=2", "synthesis.grid=401", "synthesis.tolerated_error=0.02", "synthesis.guard=0.0").work
+    work = experiment(tmp_path, "synthesis.choices=2", "synthesis.grid=401", "synthesis.teacher=value", "synthesis.tolerated_error=0.02", "synthesis.guard=0.0").work
     work.networks["dynamics"] = Line()
     work.originals["dynamics"], work.teacher_policy, work.seen_dim = Line(), lambda z: torch.zeros(len(z), 1), None
     z = torch.linspace(-1, 1, 401)[:, None]

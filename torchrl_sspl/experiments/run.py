@@ -56,6 +56,7 @@ from torchrl_sspl.trainers.trainer import SSPLTrainer
 
 MakeEnv = Callable[..., EnvBase]
 CONFIG_FILE = "config.json"
+_LARGEST = 1e30  # action; bounds beyond are none
 
 
 def agent_phases(config: Config, *, known: bool) -> list[Phase]:
@@ -166,7 +167,7 @@ class Experiment:
                 f"expected actions with bounds, received {type(env.action_spec).__name__}; GymnasiumPixels makes such of discrete ones"
             )
         self._low, self._high = space.low.cpu().float(), space.high.cpu().float()
-        if not torch.allclose(self._low, -self._high) or not bool((self._high.isfinite() & (self._high > 0.0)).all()):
+        if not torch.allclose(self._low, -self._high) or not bool(((self._high > 0.0) & (self._high < _LARGEST)).all()):
             raise ConfigError(
                 f"expected actions between -a and a for some finite a > 0, received bounds {self._low.tolist()} and {self._high.tolist()}; move their "
                 "middle to zero in a transform of the environment, as GymnasiumPixels does"
