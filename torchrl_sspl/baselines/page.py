@@ -50,7 +50,7 @@ def page(rows: Sequence[tuple[Cell, Row]], path: str | Path) -> Path:
     found = []
     for env, of_env in tables(rows).items():
         drawn = claims([cell for cell, _ in rows if cell.env == env])
-        figure = None if drawn is None else _picture(drawn, f"claimed sets on {env}")
+        figure = None if drawn is None else _picture(drawn, f"Claimed sets, {env}")
         found.append((env, figure, [(title, Table(head, lines)) for title, (head, *lines) in of_env]))
     facts = "A share is the mean of the seeds, with the worst in parentheses. Docs: the page Comparison says what the columns mean."
     return write(path, render("methods.html", title="The comparison", facts=facts, systems=found))
@@ -69,8 +69,8 @@ def claims(cells: Sequence[Cell]) -> Figure | None:
         return None
     rows = -(-len(first) // _COLUMNS)
     caption = (
-        "Claimed in the true kernel (green), claimed outside of it (red), and the rest of the kernel (grey), where the third coordinate, if "
-        "there is one, is at its middle."
+        "Green: claimed, and in the true kernel; red: claimed outside of it; grey: the rest of the kernel. A third coordinate is at its "
+        "middle; methods without a claimed set are left out."
     )
     figure = new_figure(2.2 * _COLUMNS, 2.3 * rows, caption)
     axes = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
