@@ -61,15 +61,14 @@ def test_the_table_runs_what_is_missing_and_only_that(tmp_path, monkeypatch, cap
 
 def test_cells_side_by_side_are_those_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["methods=lqr,hocbf,cone", "env=pendulum", *SMALL]
+    words = ["methods=lqr,cone", "env=pendulum", *SMALL]
     rows = table(["jobs=2", *words])
-    assert [cell.method for cell, _ in rows] == ["lqr", "hocbf", "cone"]
-    assert "expected a DubinsEnv" in rows[2][1]
-    for cell, row in rows[:2]:
-        alone = run_cell(replace(cell, out_dir=f"alone/{cell.method}"))
-        assert {n: m["value"] for n, m in row["measurements"].items() if "latency" not in n} == {
-            n: m["value"] for n, m in alone["measurements"].items() if "latency" not in n
-        }
+    assert [cell.method for cell, _ in rows] == ["lqr", "cone"]
+    (cell, row), (_, failed) = rows
+    assert "expected a DubinsEnv" in failed
+    alone = run_cell(replace(cell, out_dir="alone"))
+    for name, measured in alone["measurements"].items():
+        assert "latency" in name or row["measurements"][name]["value"] == measured["value"]
     with pytest.raises(ConfigError, match="jobs >= 1, received run=true and jobs=0"):
         table(["jobs=0", *words])
 
