@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import sys
-from base64 import b64encode
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,8 +14,9 @@ from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell
 from torchrl_sspl.baselines.table import Row, budget_of, markdown, name_of, table, tables
 from torchrl_sspl.errors import MissingDependencyError
 from torchrl_sspl.files import write
-from torchrl_sspl.viz.pages import Picture, Table, render
+from torchrl_sspl.viz.pages import Table, render
 from torchrl_sspl.viz.plane import new_figure
+from torchrl_sspl.viz.report import figure_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,8 +30,9 @@ _COLOURS = ("#ffffff", "#cfd6e4", "#4c9f70", "#c0392b")
 def main(words: Sequence[str]) -> int:
     """Measure what is missing of a table, print it, and write it, the page and all rows that there are; 0. Source: none."""
     rows = table(words)
-    print(markdown(rows))
-    write(DIRECTORY / "table.md", markdown(rows))
+    text = markdown(rows)
+    print(text)
+    write(DIRECTORY / "table.md", text)
     every = [json.loads(path.read_text()) for path in sorted(DIRECTORY.rglob(ROW_FILE))]
     write(DIRECTORY / "rows.json", json.dumps(every, indent=1) + "\n")
     try:
@@ -50,7 +50,7 @@ def page(rows: Sequence[tuple[Cell, Row]], path: str | Path) -> Path:
     found = []
     for env, of_env in tables(rows).items():
         drawn = claims([cell for cell, _ in rows if cell.env == env])
-        figure = None if drawn is None else _picture(drawn, f"Claimed sets, {env}")
+        figure = None if drawn is None else figure_picture(f"Claimed sets, {env}", drawn)
         found.append((env, figure, [(title, Table(head, lines)) for title, (head, *lines) in of_env]))
     facts = "A share is the mean of the seeds, with the worst in parentheses. Docs: the page Comparison says what the columns mean."
     return write(path, render("methods.html", title="The comparison", facts=facts, systems=found))
@@ -98,12 +98,6 @@ def _slice(path: Path) -> tuple[Any, tuple[float, ...]]:
     palette = np.array([[int(c[k : k + 2], 16) for k in (1, 3, 5)] for c in _COLOURS], np.uint8)
     low, high = states.min(0), states.max(0)
     return palette[kinds], (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
-
-
-def _picture(figure: Figure, name: str) -> Picture:
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=130)
-    return Picture(f"data:image/png;base64,{b64encode(buffer.getvalue()).decode()}", name, str(figure.get_label()), name)
 
 
 __all__ = ["claims", "main", "page"]

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
+from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -106,35 +107,25 @@ def table(words: Sequence[str]) -> list[tuple[Cell, Row]]:
 
     With ``jobs=2`` two processes measure side by side. A cell that fails is named in its row; the others go on. Source: none.
     """
-    given, own = parse(list(words)), {}
-    for name in ("run", "jobs"):
-        own[name] = given.pop(name, {"run": "true", "jobs": "1"}[name])
-    if own["run"] not in ("true", "false") or not own["jobs"].isdigit() or not int(own["jobs"]):
-        raise ConfigError(f"table: expected run=true or false and jobs >= 1, received run={own['run']} and jobs={own['jobs']}")
-    asked, jobs = cells([f"{k}={v}" for k, v in given.items()]), int(own["jobs"])
-    measure = _row if own["run"] == "true" else _stored_row
-    found: dict[Path, Row] = {}
+    given = parse(list(words))
+    run, jobs = given.pop("run", "true"), given.pop("jobs", "1")
+    if run not in ("true", "false") or not jobs.isdigit() or not int(jobs):
+        raise ConfigError(f"table: expected run=true or false and jobs >= 1, received run={run} and jobs={jobs}")
+    asked, measure, found = cells([f"{k}={v}" for k, v in given.items()]), partial(_row, run=run == "true"), list[tuple[Cell, Row]]()
     with ExitStack() as stack:
         rows: Iterable[Row] = map(measure, asked)
-        if jobs > 1 and own["run"] == "true":
-            pool = stack.enter_context(ProcessPoolExecutor(jobs, get_context("spawn")))
-            rows = pool.map(measure, asked)
+        if int(jobs) > 1:
+            rows = stack.enter_context(ProcessPoolExecutor(int(jobs), get_context("spawn"))).map(measure, asked)
         for cell, row in zip(asked, rows, strict=True):
-            found[cell.directory] = row
+            found.append((cell, row))
             print(f"{len(found)} of {len(asked)}: {cell.directory}", file=sys.stderr, flush=True)
-    return [(cell, found[cell.directory]) for cell in asked]
+    return found
 
 
-def _row(cell: Cell) -> Row:
+def _row(cell: Cell, *, run: bool) -> Row:
+    """What was measured, or why nothing was."""
     try:
-        return run_cell(cell)
-    except SSPLError as error:
-        return f"{type(error).__name__}: {error}"
-
-
-def _stored_row(cell: Cell) -> Row:
-    try:
-        return stored(cell, any_score=True) or "not measured"
+        return run_cell(cell) if run else stored(cell, any_score=True) or "not measured"
     except SSPLError as error:
         return f"{type(error).__name__}: {error}"
 

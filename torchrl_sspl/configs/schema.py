@@ -11,6 +11,7 @@ from typing import Any
 from torchrl_sspl.errors import ConfigError
 
 BACKENDS = ("sync", "process", "ray")
+LOWEST_LEVEL = -0.2  # to which held-out checks may shift the barrier
 PRESETS = ("sound", "paper", "quick", "smoke")
 _CHOICES = {
     "collector.backend": BACKENDS,
@@ -372,8 +373,8 @@ class Config:
                 f"expected synthesis.grid=0, or at least 3 nodes and synthesis.teacher=value, whose policy the targets on a grid take "
                 f"over, received grid={s.grid} and teacher={s.teacher}"
             )
-        if s.lowest_level is not None and not -0.2 <= s.lowest_level <= 0.0:
-            raise ConfigError(f"expected synthesis.lowest_level between -0.2 and 0, or null, received {s.lowest_level}")
+        if s.lowest_level is not None and not LOWEST_LEVEL <= s.lowest_level <= 0.0:
+            raise ConfigError(f"expected synthesis.lowest_level between {LOWEST_LEVEL} and 0, or null, received {s.lowest_level}")
         if s.rounds > 1 and s.rollout_transitions < 1:
             raise ConfigError(f"expected synthesis.rollout_transitions >= 1 with synthesis.rounds={s.rounds}, received {s.rollout_transitions}")
         return self

@@ -19,6 +19,8 @@ from torchrl_sspl.envs.system import System
 from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
 from torchrl_sspl.sets import UNSAFE, Region, check_disjoint, label
 
+LARGEST_ACTION = 1e30  # what calls itself bounded by more than that is not
+
 
 def check_tensor(name: str, value: Tensor, dim: int) -> None:
     """Raise DTypeError, ShapeError or NonFiniteError unless ``value`` is a finite float tensor ``(*batch, dim)``."""

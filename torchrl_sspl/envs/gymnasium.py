@@ -14,11 +14,10 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_sspl.devices import usable_device
-from torchrl_sspl.envs.base import set_specs
+from torchrl_sspl.envs.base import LARGEST_ACTION, set_specs
 from torchrl_sspl.envs.games import Game, Games, Moment, Picture, Predicate, SpreadGames
 from torchrl_sspl.errors import ConfigError, NonFiniteError
 
-_LARGE = 1e30  # what calls itself bounded by more than that is not
 _ATTEMPTS = 20
 
 
@@ -144,7 +143,7 @@ class GymnasiumPixels(EnvBase):
         if hasattr(space, "n") and hasattr(space, "start"):
             self._choices, self._start = int(space.n), int(space.start)
             self.action_dim, self._scale, self._middle = 1, np.ones(1, np.float32), np.zeros(1, np.float32)
-        elif hasattr(space, "low") and (np.abs([space.low, space.high]) < _LARGE).all():
+        elif hasattr(space, "low") and (np.abs([space.low, space.high]) < LARGEST_ACTION).all():
             self._action_shape, self._action_dtype = space.shape, space.dtype
             low, high = space.low.reshape(-1).astype(np.float32), space.high.reshape(-1).astype(np.float32)
             self.action_dim, self._scale, self._middle = len(low), (high - low) / 2, (high + low) / 2

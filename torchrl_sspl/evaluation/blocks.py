@@ -19,7 +19,7 @@ from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, NonFiniteError, SSPLError
 from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, RandomController
 from torchrl_sspl.evaluation.measurements import MakeEnv
-from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.evaluation.simulation import Episodes, looked_at, simulate
 from torchrl_sspl.functional import covering_radius
 from torchrl_sspl.modules.agent import Agent, on_host
 from torchrl_sspl.modules.controller import premise_met
@@ -221,8 +221,7 @@ class StateBlocks:
             run = simulate(AgentController(self.agent), self.env, start=start, horizon=self.record.horizon)
         except NonFiniteError:
             return None
-        if self.env.exit_region == SAFE and run.states is not None:  # who is gone is asked nothing any more
-            run.alive = run.alive & self.env.state_space.contains(run.states)
+        run.alive = looked_at(run, self.env)
         return run
 
     def _see(self, before: Tensor | None, state: Tensor) -> Tensor:

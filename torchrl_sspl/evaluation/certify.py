@@ -203,9 +203,9 @@ def issue(path: str | Path, env: SafetyEnv | MakeEnv | None = None, **settings: 
         same = {"level": before.level} if before.weights == weights_digest(agent.state_dict()) else {}
         settings = {"name": before.agent} | same | settings
         if before.record is not None:
-            kept = ("episodes", "horizon", "seed", "confidence", "acceptable")
+            names = ("episodes", "horizon", "seed", "confidence", "acceptable")
             used = {"used_seeds": before.record.used or ()}  # what was said to be used is used for ever
-            settings = {k: getattr(before.record, k) for k in kept} | used | settings
+            settings = {k: getattr(before.record, k) for k in names} | used | settings
             envs = {"envs": before.record.envs} if before.record.kind == "resets" else {}
     except CertificationError:
         settings = {"name": directory.parent.name if directory.name == "agent" else directory.name} | settings

@@ -17,11 +17,11 @@ from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, Camera, Controller, as_controller
 from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, quantiles, share
-from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.evaluation.simulation import Episodes, looked_at, simulate
 from torchrl_sspl.journal import kept_parts
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules.agent import Agent, on_host
-from torchrl_sspl.sets import SAFE, UNSAFE, Region
+from torchrl_sspl.sets import UNSAFE, Region
 from torchrl_sspl.viability.grid import ViabilityKernel, recoverable_set, viability_kernel
 
 
@@ -311,9 +311,7 @@ def _from_the_set(run: _Run) -> None:
     barrier = found.barrier
     out.count("safe_rollouts_touch_unsafe", _touched(found), note)
     out.count("safe_rollouts_leave", (barrier > 0).any(0), note)
-    stepped = found.alive[1:]
-    if env.exit_region == SAFE:  # nobody looks at whoever is gone
-        stepped = stepped & env.state_space.contains(found.states[1:])
+    stepped = looked_at(found, env)[1:]
     if run.agent is not None and run.agent.held_error > 0:  # of the memory it is proved; what is seen may lie outside
         out.count("safe_rollouts_seen_outside", (found.seen > 0).any(0), f"{note}, B > 0 for an observation by itself")
         out.count("corrections_cut", found.cut[1:] & stepped, f"steps of {note}, correction that would leave the set", stepped, independent=False)

@@ -96,6 +96,13 @@ class Episodes:
         return Episodes(**columns, events={name: value[index] for name, value in self.events.items()})
 
 
+def looked_at(found: Episodes, env: Any) -> Tensor:
+    """Observations ``(T + 1, n)``, bool, of which anything was asked: where leaving counts as safe nobody looks at whoever is gone."""
+    if getattr(env, "exit_region", UNSAFE) != SAFE or found.states is None:
+        return found.alive
+    return found.alive & env.state_space.contains(found.states)
+
+
 @torch.no_grad()
 def simulate(
     controller: Any,

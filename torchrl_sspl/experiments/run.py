@@ -28,7 +28,7 @@ from torchrl_sspl.configs.schema import Config, LabelsConfig
 from torchrl_sspl.data import Augmentation, Labels, TransitionStore
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions, make_collector
 from torchrl_sspl.devices import usable_device
-from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.base import LARGEST_ACTION, SafetyEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError, EmptyRegionError, MissingDependencyError
 from torchrl_sspl.evaluation.certify import CERTIFICATE_FILE, certify, certify_on_episodes, premise
 from torchrl_sspl.evaluation.episodes import evaluate_episodes, logged
@@ -56,7 +56,6 @@ from torchrl_sspl.trainers.trainer import SSPLTrainer
 
 MakeEnv = Callable[..., EnvBase]
 CONFIG_FILE = "config.json"
-_LARGEST = 1e30  # action; bounds beyond are none
 
 
 def agent_phases(config: Config, *, known: bool) -> list[Phase]:
@@ -167,7 +166,7 @@ class Experiment:
                 f"expected actions with bounds, received {type(env.action_spec).__name__}; GymnasiumPixels makes such of discrete ones"
             )
         self._low, self._high = space.low.cpu().float(), space.high.cpu().float()
-        if not torch.allclose(self._low, -self._high) or not bool(((self._high > 0.0) & (self._high < _LARGEST)).all()):
+        if not torch.allclose(self._low, -self._high) or not bool(((self._high > 0.0) & (self._high < LARGEST_ACTION)).all()):
             raise ConfigError(
                 f"expected actions between -a and a for some finite a > 0, received bounds {self._low.tolist()} and {self._high.tolist()}; move their "
                 "middle to zero in a transform of the environment, as GymnasiumPixels does"

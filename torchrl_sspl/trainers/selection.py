@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from torchrl_sspl.configs.schema import LOWEST_LEVEL
 from torchrl_sspl.evaluation.certify import premise
 from torchrl_sspl.evaluation.controllers import AgentController, RandomController, covered
 from torchrl_sspl.evaluation.episodes import separating_level
@@ -20,7 +21,6 @@ from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.trainers.phases import Check, Phase, Workspace
 
 _HIGHEST_LEVEL = 0.08  # to which the barrier may be shifted by the held-out checks
-_LOWEST_LEVEL = -0.2
 _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away from what the set tolerates
 _UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
 _STEP, _TRIED = 2, 6  # levels between two for which a proof is tried, and how many of these
@@ -78,7 +78,7 @@ class CheckRound(Phase):
         if held_out is None:
             found = Check(self.number, 0.0, 0, 0, 0, 0, 0.0, 0.0, False, "the set is empty")
         else:
-            levels = torch.linspace(_LOWEST_LEVEL, _HIGHEST_LEVEL, 57).flip(0).tolist()
+            levels = torch.linspace(LOWEST_LEVEL, _HIGHEST_LEVEL, 57).flip(0).tolist()
             lowest = work.config.lowest_level
             if lowest is None:
                 lowest = -_MOST_OF_MARGIN * work.config.margin  # below it the condition says nothing of the level

@@ -229,7 +229,7 @@ def _film(path: Path, caption: str) -> Picture:
     return Picture(file_uri(path), caption, caption, poster=file_uri(poster) if poster.is_file() else "")
 
 
-def _figure(name: str, value: Any) -> Picture:
+def figure_picture(name: str, value: Any) -> Picture:
     """One figure: a matplotlib Figure (its label is the caption), a path, or a pair (either, caption)."""
     caption = ""
     if isinstance(value, tuple) and len(value) == 2:
@@ -349,7 +349,7 @@ def write_report(
         "report.html", title=title, facts=" / ".join(_facts(config)), headline=first, kind=kind, mark=MARKS[kind], more=more,
         columns=_columns(lists), kernel=kernel, film=None if video is None else _film(Path(video), video_caption),
         requirements=requirements, certificate=certificate or "", notes=_paragraphs(notes),
-        figures=[_figure(n, f) for n, f in (figures or {}).items()], checks=_sizes(checks) if checks else None,
+        figures=[figure_picture(n, f) for n, f in (figures or {}).items()], checks=_sizes(checks) if checks else None,
         measurements=_measurements(data) if data else None, configuration=_configuration(config) if config else None,
     )  # fmt: skip
     return write(path, page)
