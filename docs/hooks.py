@@ -7,6 +7,7 @@ nothing from elsewhere.
 from __future__ import annotations
 
 import ast
+import functools
 import html
 import json
 import logging
@@ -128,6 +129,12 @@ def api_index() -> str:
     return "\n".join([*lines, f"| {anchor('__version__')}`sspl.__version__` | version of the library |", ""])
 
 
+@functools.cache
+def statements(path: Path) -> list[ast.stmt]:
+    """What a file of the library consists of; names are looked up in it again and again."""
+    return ast.parse(path.read_text()).body
+
+
 def definition(dotted: str) -> ast.FunctionDef | ast.ClassDef | None:
     """A function or class, wherever in its part it is written; None for a constant."""
     part, *inner, name = dotted.split(".")[1:]
@@ -136,7 +143,7 @@ def definition(dotted: str) -> ast.FunctionDef | ast.ClassDef | None:
     if inner:
         paths = [root.joinpath(*inner).with_suffix(".py"), root.joinpath(*inner, "__init__.py"), *paths]
     for path in filter(Path.is_file, paths):
-        for node in ast.parse(path.read_text()).body:
+        for node in statements(path):
             if getattr(node, "name", None) == name and isinstance(node, ast.FunctionDef | ast.ClassDef):
                 return node
     return None

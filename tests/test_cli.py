@@ -81,7 +81,7 @@ MALFORMED = [
     ("env.batch_size=[3]", "received 'env.batch_size'"),
     ("network=3", "received 'network'; the nearest are network.latent_dim"),
     ("trainer=rounds", "received 'trainer'; the nearest are trainer.total_frames"),
-    ("env=pendulm", "expected env to be one of cmu, dubins, gymnasium, pendulum, quadruped"),
+    ("env=pendulm", "expected env to be one of cmu, dubins, gymnasium, pendulum, quadruped, two_discs"),
     ("env=gone.yaml", "or an existing .yaml file, received 'gone.yaml'"),
     ("preset=sond", "expected preset to be one of sound, paper, quick, smoke, received 'sond'"),
     ("logger=csvv", "expected logger.kind to be one of"),
@@ -139,7 +139,7 @@ def test_what_is_malformed_is_named_and_leaves_nothing(word, said, capsys, tmp_p
 
 def test_no_system_is_named(capsys):
     assert cli.main(["train", "seed=1"]) == 2
-    assert "choose env=cmu|dubins|gymnasium|pendulum|quadruped" in capsys.readouterr().err
+    assert "choose env=cmu|dubins|gymnasium|pendulum|quadruped|two_discs" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -33,7 +33,7 @@ def load(name: str) -> ModuleType:
 
 
 hooks, check_site = load("hooks"), load("check_site")
-api_pages = functools.cache(hooks.api_pages)  # ten seconds
+api_pages = functools.cache(hooks.api_pages)
 
 
 def code(path: Path) -> str:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
+import torch
 
+from torchrl_sspl.baselines import BUDGETS, make
 from torchrl_sspl.baselines.__main__ import main
-from torchrl_sspl.baselines.cell import ROW_FILE, Cell, run_cell
-from torchrl_sspl.baselines.page import claims
+from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell, run_cell
+from torchrl_sspl.baselines.page import claims, failures, page
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.baselines.table import DEFAULTS, TICKS, cells, markdown, table
 from torchrl_sspl.errors import ConfigError
@@ -57,6 +61,24 @@ def test_the_table_runs_what_is_missing_and_only_that(tmp_path, monkeypatch, cap
     colours = {tuple(c) for c in axes.images[0].get_array().reshape(-1, 3).tolist()}
     assert {(76, 159, 112), (207, 214, 228), (255, 255, 255)} <= colours  # claimed, the rest of the kernel, outside
     assert "not measured" not in markdown(table(["run=false", "methods=lqr", "env=pendulum"]))  # measured with other sizes, and said so
+
+
+def test_a_failure_is_filmed_from_a_start_that_is_claimed_until_it_is_in_u(tmp_path):
+    sizes = ["score.episodes=10", "score.horizon=80", "score.grid=21", "score.kernel_grid=31", "score.frames=2", "env=pendulum"]
+    fails, safe = (Cell.of(name, [*words, f"out_dir={tmp_path / name}", *sizes]) for name, words in (("depth", ["beta=0.5"]), ("lqr", [])))
+    for cell in (fails, safe):
+        run_cell(cell)
+    with np.load(fails.directory / CLAIMS_FILE) as body:
+        states = torch.from_numpy(body["failed_harmless"])
+    env, method = fails.environment(), make("depth", ["beta=0.5"])
+    method.fit(None, env, BUDGETS["tiny"], 0)
+    assert states.shape == (81, 2)
+    assert method.claims(states[:1]).item()
+    assert env.unsafe_set.contains(states).any()
+    rows = [(cell, json.loads((cell.directory / ROW_FILE).read_text())) for cell in (safe, fails)]
+    assert page(rows, tmp_path / "table.html").read_text().count("data:video/mp4") == 1
+    assert (tmp_path / "failures-pendulum.mp4").stat().st_size > 10_000
+    assert failures([safe], tmp_path / "none.mp4") is None
 
 
 def test_cells_side_by_side_are_those_one_after_the_other(tmp_path, monkeypatch):

@@ -94,7 +94,7 @@ class _Mean(torch.nn.Module):
 
 
 def test_a_run_uses_no_more_labels_than_it_may(tmp_path):
-    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false"]
+    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false", "synthesis.rounds=1"]
     run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11"]))
     run.train()
     budget = run.work.source.budget

@@ -11,6 +11,7 @@ from torch import nn
 from torch.nn import functional as F
 
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
+from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError
 from torchrl_sspl.modules import (
@@ -20,6 +21,7 @@ from torchrl_sspl.modules import (
     Policy,
     ShapeBearingEncoder,
     ShapeEncoder,
+    ShapePlaceEncoder,
 )
 from torchrl_sspl.modules.agent import Agent, mlp_barrier
 from torchrl_sspl.modules.moments import Bearing
@@ -194,6 +196,51 @@ def test_an_encoder_of_the_disc_leaves_entries_to_the_memory_and_survives_disk(d
     for wrong in ({"latent_dim": 1}, {"latent_dim": 2, "reach": 0.0}):
         with pytest.raises(ConfigError, match="latent_dim >= 2 and reach > 0"):
             ShapeBearingEncoder(**wrong)
+
+
+@pytest.fixture(scope="module")
+def comet():
+    """Encoder of places fitted to 500 frames of comets and goals, and fresh states away from the border."""
+    env, generator = CMUTwoDiscsEnv(), torch.Generator().manual_seed(0)
+    encoder = ShapePlaceEncoder(5, 128, pool_to=128)
+    encoder.fit(env.draw(env.sample_states(500, generator)))
+    return env, encoder, env.sample_states(200, generator) * torch.tensor([0.8, 0.8, 1.0, 1.0])
+
+
+def test_a_thing_of_one_colour_is_where_it_is_and_heads_where_it_does(comet):
+    env, encoder, states = comet
+    latent = encoder(env.observe(states)).detach()
+    assert latent.shape == (200, 5)
+    assert not latent[:, 4].any()
+    assert torch.allclose(latent[:, 2:4].norm(dim=1), torch.tensor(0.3))
+    off = torch.remainder(torch.atan2(-latent[:, 3], latent[:, 2]) - states[:, 2] + math.pi, 2 * math.pi) - math.pi
+    assert off.square().mean().sqrt() < math.radians(1.5)
+    ahead = torch.stack([states[:, 2].cos(), states[:, 2].sin()], -1)
+    place = torch.atanh(latent[:, :2]) * 1.5 * torch.tensor([1.0, -1.0])  # m; its middle lies ahead of its tail
+    assert (place - states[:, :2] - 0.044 * ahead).norm(dim=1).mean() < 0.006  # a pixel has 0.023 m
+
+
+def test_a_thing_of_another_colour_is_nothing(comet):
+    env, encoder, states = comet
+    moved = states.clone()
+    moved[:, 3] = -states[:, 3]
+    far = ((states[:, :2] - torch.tensor([1.3, 0.0])).abs() > torch.tensor([0.3, 0.0])).all(1)  # neither goal lies under the car
+    seen, other = encoder(env.observe(states[far])), encoder(env.observe(moved[far]))
+    assert (seen - other).abs().max() < 1e-4
+    plain = ShapeBearingEncoder(2, 128, pool_to=128)  # all that differs from the background counts
+    plain.fit(env.draw(states))
+    assert (plain(env.observe(states[far])) - plain(env.observe(moved[far]))).abs().max() > 0.05
+
+
+def test_an_encoder_of_places_survives_disk_and_refuses_sizes_that_are_none(comet):
+    env, encoder, states = comet
+    twin = ShapePlaceEncoder(**encoder.arguments)
+    twin.load_state_dict(encoder.state_dict())
+    assert torch.equal(twin(env.observe(states[:9])), encoder(env.observe(states[:9])))
+    assert encoder(torch.full((1, 6, 128, 128), 255, dtype=torch.uint8)).isfinite().all()
+    for wrong, message in (({"latent_dim": 3}, "latent_dim >= 4"), ({"latent_dim": 4, "turn_radius": 0.0}, "turn_radius"), ({"latent_dim": 4, "reach": 0.0}, "reach > 0")):
+        with pytest.raises(ConfigError, match=message):
+            ShapePlaceEncoder(**wrong)
 
 
 @pytest.fixture(scope="module")

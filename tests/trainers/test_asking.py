@@ -80,7 +80,7 @@ def test_labels_of_one_side_alone_are_refused(codes):
 
 
 def test_a_run_asks_for_as_many_labels_as_it_may(tmp_path):
-    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false"]
+    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false", "synthesis.rounds=1"]
     run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11", "labels.choose=30"]))
     run.train()
     budget, latents = run.work.source.budget, run.work.latents

@@ -238,7 +238,8 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         claims = found.arrays
         if "barrier" in claims:
             packed = io.BytesIO()
-            np.savez_compressed(packed, states=claims["states"], claimed=claims["barrier"] <= 0.0, viable=claims["viable"])
+            failed = {name: value for name, value in claims.items() if name.startswith("failed_")}
+            np.savez_compressed(packed, states=claims["states"], claimed=claims["barrier"] <= 0.0, viable=claims["viable"], **failed)
             write(directory / CLAIMS_FILE, packed.getvalue())
         write(directory / ROW_FILE, json.dumps(row, indent=1) + "\n")
         return row

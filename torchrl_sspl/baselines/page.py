@@ -1,4 +1,4 @@
-"""One page of the comparison: its tables, and for each system the claimed sets of all methods over the true kernel."""
+"""One page of the comparison: its tables, and for each system the claimed sets of all methods over the true kernel, and how they fail."""
 
 from __future__ import annotations
 
@@ -9,20 +9,24 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell
+from torchrl_sspl.baselines.scoring import NOMINALS
 from torchrl_sspl.baselines.table import Row, budget_of, markdown, name_of, table, tables
 from torchrl_sspl.errors import MissingDependencyError
 from torchrl_sspl.files import write
+from torchrl_sspl.viz.animation import Scene, Take, animate
 from torchrl_sspl.viz.pages import Table, render
-from torchrl_sspl.viz.plane import new_figure
-from torchrl_sspl.viz.report import figure_picture
+from torchrl_sspl.viz.plane import Plane, new_figure
+from torchrl_sspl.viz.report import figure_picture, film_picture
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIRECTORY = Path("runs/baselines")
 _COLUMNS = 5
+_AFTER = 0.5  # s, for which what went wrong is still looked at
 #: Outside the kernel, in it and not claimed, claimed in it, claimed outside of it.
 _COLOURS = ("#ffffff", "#cfd6e4", "#4c9f70", "#c0392b")
 
@@ -43,15 +47,18 @@ def main(words: Sequence[str]) -> int:
 
 
 def page(rows: Sequence[tuple[Cell, Row]], path: str | Path) -> Path:
-    """Writes a self-contained page with the tables of :mod:`~torchrl_sspl.baselines.table`, and a figure for each system.
+    """Writes a self-contained page with the tables of :mod:`~torchrl_sspl.baselines.table`, a figure and a film for each system.
 
-    Returns the file. Raises MissingDependencyError without matplotlib. Source: none.
+    The films lie beside it. Returns the page. Raises MissingDependencyError without matplotlib. Source: none.
     """
-    found = []
+    found, path = [], Path(path)
     for env, of_env in tables(rows).items():
-        drawn = claims([cell for cell, _ in rows if cell.env == env])
-        figure = None if drawn is None else figure_picture(f"Claimed sets, {env}", drawn)
-        found.append((env, figure, [(title, Table(head, lines)) for title, (head, *lines) in of_env]))
+        cells = [cell for cell, _ in rows if cell.env == env]
+        drawn, film = claims(cells), failures(cells, path.with_name(f"failures-{env}.mp4"))
+        figures = [] if drawn is None else [figure_picture(f"Claimed sets, {env}", drawn)]
+        if film is not None:
+            figures.append(film_picture(film, "One failure of every method that has any: from its claimed set into U. Solid: what it claims; dashed: the true kernel."))
+        found.append((env, figures, [(title, Table(head, lines)) for title, (head, *lines) in of_env]))
     facts = "A share is the mean of the seeds, with the worst in parentheses. Docs: the page Comparison says what the columns mean."
     return write(path, render("methods.html", title="The comparison", facts=facts, systems=found))
 
@@ -61,10 +68,7 @@ def claims(cells: Sequence[Cell]) -> Figure | None:
 
     Of a system of three coordinates the figure shows the third at its middle. Source: none.
     """
-    first: dict[str, Path] = {}
-    for cell in cells:
-        if (cell.directory / CLAIMS_FILE).is_file():
-            first.setdefault(f"{name_of(cell)}\n{budget_of(cell)}, seed {cell.seed}", cell.directory / CLAIMS_FILE)
+    first = _first(cells)
     if not first:
         return None
     rows = -(-len(first) // _COLUMNS)
@@ -84,6 +88,42 @@ def claims(cells: Sequence[Cell]) -> Figure | None:
     return figure
 
 
+def failures(cells: Sequence[Cell], path: Path) -> Path | None:
+    """Film of one failure of every method that has any on one system: from where it claims safety into U; None without any.
+
+    Shown is an episode from a start that could be kept safe, if there is one, up to half a second in U. Source: none.
+    """
+    found = [(title, kept) for title, kept in _first(cells).items() if any(f"failed_{n}" in np.load(kept) for n in NOMINALS)]
+    if not found:
+        return None
+    env = cells[0].environment()
+    scenes = (_failure(env, title.replace("\n", ", "), kept) for title, kept in found)
+    return animate(scenes, path, plane=Plane.of(env, env.system.state_names[:2]), fps=round(1 / env.dt))  # type: ignore[arg-type, attr-defined]
+
+
+def _failure(env: Any, title: str, path: Path) -> Scene:
+    with np.load(path) as body:
+        nominal = next(n for n in NOMINALS if f"failed_{n}" in body)
+        states, grid, viable = (torch.from_numpy(body[name]) for name in (f"failed_{nominal}", "states", "viable"))
+        levels = grid.numpy(), {"B": body["claimed"], "kernel": body["viable"]}
+    unsafe = env.unsafe_set.contains(states)
+    end = int(unsafe.int().argmax()) + round(_AFTER / env.dt)
+    states, unsafe = states[: end + 1], unsafe[: end + 1]
+    kept = viable[(states[:, None] - grid).abs().div(grid.amax(0) - grid.amin(0)).amax(2).argmin(1)]
+    said = [("in the unsafe set U", "bad") if u else ("could be kept safe", "good") if k else ("cannot be kept safe", "fair") for u, k in zip(unsafe, kept, strict=True)]
+    pictures = (env.portrait(x[None])[0].permute(1, 2, 0).numpy() for x in states)
+    return Scene(f"{title}: {nominal} nominal policy", [Take("what happens", pictures, said, states)], levels)
+
+
+def _first(cells: Sequence[Cell]) -> dict[str, Path]:
+    """Where the claims of the first measured seed of every method and budget lie, by their titles."""
+    first: dict[str, Path] = {}
+    for cell in cells:
+        if (cell.directory / CLAIMS_FILE).is_file():
+            first.setdefault(f"{name_of(cell)}\n{budget_of(cell)}, seed {cell.seed}", cell.directory / CLAIMS_FILE)
+    return first
+
+
 def _slice(path: Path) -> tuple[Any, tuple[float, ...]]:
     """Colours ``(y, x, 3)`` of a slice of the grid, and its borders."""
     with np.load(path) as body:
@@ -100,4 +140,4 @@ def _slice(path: Path) -> tuple[Any, tuple[float, ...]]:
     return palette[kinds], (float(low[0]), float(high[0]), float(low[1]), float(high[1]))
 
 
-__all__ = ["claims", "main", "page"]
+__all__ = ["claims", "failures", "main", "page"]

@@ -12,8 +12,9 @@ from torchrl_sspl.baselines.data import POOL, Recording, pooled
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
+from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.modules import FrameEncoder, MomentEncoder
+from torchrl_sspl.modules import FrameEncoder, MomentEncoder, ShapePlaceEncoder
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.trainers.phases import InnerLoop
 
@@ -60,16 +61,17 @@ class Coordinates:
 
 
 def encoder_for(env: SafetyEnv, size: int, data: Recording) -> FrameEncoder:
-    """The encoder that this library recommends for the system, on pooled pictures; untrained. Source: none.
+    """The encoder that this library recommends for the system, on pictures of the recording's size; untrained. Source: none.
 
     Args:
         env: the system.
         size: of what it gives.
         data: pictures from which an encoder of moments takes its background.
     """
-    if not isinstance(env, DubinsEnv):
+    if not isinstance(env, DubinsEnv | CMUTwoDiscsEnv):
         return FrameEncoder(size, pool_to=POOL)
-    encoder = MomentEncoder(max(size, 4), pool_to=POOL)
+    kind = MomentEncoder if isinstance(env, DubinsEnv) else ShapePlaceEncoder
+    encoder = kind(max(size, 4), pool_to=data.frames.shape[-1])
     rows = torch.arange(len(data))[:: max(1, len(data) // 2000)]
     encoder.fit(data.frames[rows, 1])
     return encoder

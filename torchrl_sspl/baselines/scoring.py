@@ -120,8 +120,8 @@ def barrier_on(method: SafetyMethod, env: SafetyEnv, state: Tensor, album: Album
     return torch.cat(values) if values else torch.zeros(0)
 
 
-def paths(method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal, horizon: int) -> tuple[Guarded, Tensor]:
-    """What acted from states ``(n, s)``, and ``(n,)`` which of the episodes enter U. Source: none.
+def paths(method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal, horizon: int) -> tuple[Guarded, Tensor, Tensor]:
+    """What acted from states ``(n, s)``, ``(n,)`` which of the episodes enter U, and where they went, ``(horizon + 1, n, s)``. Source: none.
 
     Example:
         >>> from torchrl_sspl.baselines import BUDGETS, make
@@ -134,7 +134,8 @@ def paths(method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal,
     # Each frame is averaged once, not with every observation that holds it.
     draw = (lambda state: pooled(env.draw(state))) if method.pools else env.draw
     run = simulate(acts, env, start=start, horizon=horizon, draw=draw)
-    return acts, ((run.region == UNSAFE) & run.alive).any(0)
+    assert run.states is not None
+    return acts, ((run.region == UNSAFE) & run.alive).any(0), run.states
 
 
 @dataclass
@@ -155,7 +156,7 @@ class _Score:
         value = self.barrier(state)
         return torch.zeros(len(state), dtype=torch.bool) if value is None else value <= 0
 
-    def episodes(self, start: Tensor, nominal: Nominal) -> tuple[Guarded, Tensor]:
+    def episodes(self, start: Tensor, nominal: Nominal) -> tuple[Guarded, Tensor, Tensor]:
         return paths(self.method, self.env, start, nominal, self.config.horizon)
 
     def starts(self, keep, index: int, n: int) -> Tensor:
@@ -274,8 +275,12 @@ def _loops(it: _Score, name: str, keep, index: int) -> list[tuple[Tensor, Tensor
             it.out.missing(f"{key}_enter", f"{key}_infeasible", note=f"the {name} set is empty")
             it.out.missing(f"{key}_deviation", unit="physical units", note=f"the {name} set is empty")
             continue
-        acts, entered = it.episodes(start, make(it.env))
+        acts, entered, states = it.episodes(start, make(it.env))
         it.out.count(f"{key}_enter", entered, where)
+        if name == "claimed" and bool(entered.any()):  # for a film, of a start that could be kept safe if there is one
+            telling = entered & it.kernel.contains(start)
+            chosen = telling if bool(telling.any()) else entered
+            it.out.arrays[f"failed_{label}"] = states[:, int(chosen.int().argmax())]
         steps = max(1, acts.steps)
         it.out.add(Measurement(f"{key}_infeasible", acts.infeasible / steps, "share", steps, note=f"steps of {where}, not independent"))
         it.out.add(Measurement(f"{key}_deviation", acts.deviation / steps, "physical units", steps, note=f"mean distance, steps of {where}"))

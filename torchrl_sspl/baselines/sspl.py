@@ -22,7 +22,7 @@ from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.controllers import AgentController, Camera
 from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.modules.agent import Agent, agent_directory, load
-from torchrl_sspl.runtime.filter import UNPROVED_MARGIN, Shield
+from torchrl_sspl.runtime.filter import LEVEL, UNPROVED_MARGIN, Shield
 
 _PLAIN = [
     "augmentation.share=0.0", "synthesis.steady_steps=0", "synthesis.dynamics_steps=1500", "synthesis.unsafe_margin=0.05",
@@ -65,6 +65,7 @@ class SSPLConfig:
 
     agent: str = ""  # shipped agent or run directory; "": train
     filter: bool = False  # behind the nominal policy, in place of the agent's own policy
+    level: float = LEVEL  # of the filter
     overrides: list[str] = field(default_factory=list)  # further key=value of the training
 
 
@@ -93,7 +94,8 @@ class SSPL(SafetyMethod):
         )  # fmt: skip
         shield = None
         if self.config.filter:
-            shield = Shield(self.agent) if self.agent.tolerated_error > 0 else Shield(self.agent, margin=UNPROVED_MARGIN)
+            margin = None if self.agent.tolerated_error > 0 else UNPROVED_MARGIN
+            shield = Shield(self.agent, level=self.config.level, margin=margin)
         self.shield = shield
 
     def _told(self) -> dict[str, int]:

@@ -29,6 +29,7 @@ _LEAST = {
     "evaluation.kernel_grid evaluation.certificate_episodes evaluation.certificate_seconds synthesis.steady_steps synthesis.dynamics_steps "
     "synthesis.teach_steps synthesis.fit_steps synthesis.steer_steps synthesis.tune_steps synthesis.tighten_steps synthesis.dynamics_outlier "
     "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices",
+    4: "synthesis.turns",
     1: "evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.batch synthesis.residuals synthesis.actions "
     "synthesis.rim_draws synthesis.check_episodes synthesis.check_horizon",
 }
@@ -56,7 +57,7 @@ class NetworkConfig:
     policy_hidden: list[int] = _option([32, 32], "widths of the policy's hidden layers.")
     encoder: str = _option("FrameEncoder", 'name of an encoder of the library ("FrameEncoder": convolutions, '
         '"ContrastEncoder": convolutions on what differs from the background, "MomentEncoder": centres of colours before a background, "ShapeEncoder": place and direction of one thing of one '
-        'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves, "TurnedBearingEncoder": and its orientation, "ShapeBearingEncoder": the same as BearingEncoder for what moves in one colour), or "package.module:Class" of your own, called with '
+        'colour, "BearingEncoder": where the thing that stands still lies, seen from the one that moves, "TurnedBearingEncoder": and its orientation, "ShapeBearingEncoder": the same as BearingEncoder for what moves in one colour, "ShapePlaceEncoder": where that is and heads), or "package.module:Class" of your own, called with '
         'those of latent_dim, image_size, pool_to and velocity_gain that it takes.')
     pool_to: int = _option(32, "frames are averaged to this height and width before the first layer, in pixels.")
     velocity_gain: float = _option(4.0, "factor on the difference of the two frames' features.")
@@ -209,6 +210,7 @@ class SynthesisConfig:
     grid: int = _option(0, "nodes per entry that pictures show of a grid over the latent domain, on which the barrier's targets are found "
         "by dynamic programming, under four times tolerated_error and with the actions of choices; for latents that the data fill. 0: the "
         "targets are found on the cloud of the data.")
+    turns: int = _option(32, "nodes of that grid around a direction, where the latent holds one.")
     tolerated_error: float = _option(0.0, "error per step that the set is meant to be proved to tolerate, latent units: the "
         "invariant set of the data keeps a quarter more, the fine-tuning requires the condition under the worst error of this size, and "
         "then the training uses counterexamples of the proof. 0: residual_spread counts, and the proof is not considered.")

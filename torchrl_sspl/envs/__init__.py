@@ -10,8 +10,9 @@ from torchrl_sspl.envs.pendulum import PendulumEnv as PendulumEnv  # not in __al
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
 from torchrl_sspl.envs.system import Opening, Requirement, System
+from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
 
 __all__ = [
-    "CMUDubinsEnv", "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "Opening", "PendulumRenderer", "PixelPendulumEnv",
+    "CMUDubinsEnv", "CMUTwoDiscsEnv", "DubinsEnv", "GymnasiumPixels", "GymnasiumRenderer", "Opening", "PendulumRenderer", "PixelPendulumEnv",
     "Requirement", "SafetyEnv", "System",
 ]  # fmt: skip

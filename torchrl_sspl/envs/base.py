@@ -48,7 +48,7 @@ def set_specs(env: EnvBase, image_size: int, state_dim: int, bound: Tensor) -> N
     """Give an environment of stacked frames its specs; actions are within ``bound``, ``(action_dim,)``, of zero."""
     shape, device = env.batch_size, env.device
     entries: dict[str, Any] = {
-        "pixels": Bounded(0, 255, shape=(*shape, 6, image_size, image_size), dtype=torch.uint8, device=device),
+        "pixels": Unbounded(shape=(*shape, 6, image_size, image_size), dtype=torch.uint8, device=device),
         "region": Categorical(3, shape=(*shape, 1), dtype=torch.int64, device=device),
     }
     if state_dim:

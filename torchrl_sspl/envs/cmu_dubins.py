@@ -31,13 +31,11 @@ _REQUIREMENTS = (
 Colour = Sequence[float]
 
 
-class _Stays(Region):
-    """States (x, y, heading) whose next step ends in the square around the origin."""
+class Stays(Region):
+    """States (x, y, heading, ...) whose next step straight ahead ends in the square around the origin."""
 
-    dim = 3
-
-    def __init__(self, half_size: float, step: float) -> None:
-        self.half_size, self.step = half_size, step
+    def __init__(self, half_size: float, step: float, dim: int = 3) -> None:
+        self.half_size, self.step, self.dim = half_size, step, dim
 
     def contains(self, state: Tensor) -> Tensor:
         check_tensor("state", state, self.dim)
@@ -109,7 +107,7 @@ class CMUDubinsEnv(DubinsEnv):
             safe_half_size=ARENA - SPEED * STEP, unsafe_half_size=FAILURE, obstacle_half_size=FAILURE,
             obstacle_shape="disc", horizon=horizon, initial_set=initial_set, device=device, seed=seed,
         )  # fmt: skip
-        self.safe_set = Difference(self.safe_set, _Stays(ARENA, SPEED * STEP))
+        self.safe_set = Difference(self.safe_set, Stays(ARENA, SPEED * STEP))
         self.arrow_scale, self.arrow_width, self.dot_area = float(arrow_scale), float(arrow_width), float(dot_area)
         self.background, self.obstacle_colour = _colour("background", background), _colour("obstacle_colour", obstacle_colour)
         self.car_colour = _colour("car_colour", car_colour)

@@ -9,6 +9,7 @@ from torchrl_sspl.modules.moments import (
     MomentEncoder,
     ShapeBearingEncoder,
     ShapeEncoder,
+    ShapePlaceEncoder,
     TurnedBearingEncoder,
 )
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
@@ -29,6 +30,7 @@ __all__ = [
     "SaLaD",
     "ShapeBearingEncoder",
     "ShapeEncoder",
+    "ShapePlaceEncoder",
     "TurnedBearingEncoder",
     "as_tensordict_module",
     "inward_clamp",

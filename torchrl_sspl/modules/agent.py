@@ -31,6 +31,7 @@ from torchrl_sspl.modules.moments import (
     MomentEncoder,
     ShapeBearingEncoder,
     ShapeEncoder,
+    ShapePlaceEncoder,
     TurnedBearingEncoder,
 )
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
@@ -55,7 +56,7 @@ def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
 ENCODERS: dict[str, type[nn.Module]] = {
     "FrameEncoder": FrameEncoder, "ContrastEncoder": ContrastEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder,
-    "ShapeBearingEncoder": ShapeBearingEncoder, "BearingEncoder": BearingEncoder,
+    "ShapeBearingEncoder": ShapeBearingEncoder, "ShapePlaceEncoder": ShapePlaceEncoder, "BearingEncoder": BearingEncoder,
     "TurnedBearingEncoder": TurnedBearingEncoder,
 }  # fmt: skip
 DYNAMICS: dict[str, type[nn.Module]] = {"LatentDynamics": LatentDynamics}

@@ -196,10 +196,13 @@ class ShapeMoments(nn.Module):
         self.register_buffer("scale", torch.ones(5))
         self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
 
+    def weight(self, frames: Tensor) -> Tensor:
+        """How much of the thing every pixel shows, ``(n, H, W)``; what a camera's noise changes is not a thing."""
+        return ((frames - self.background).abs().amax(1) - NOISE).clamp_min(0.0)
+
     def moments(self, frames: Tensor) -> Tensor:
         """Moments ``(n, 5)``, not scaled, of frames ``(n, c, H, W)`` in [-1, 1]; x to the right, y down."""
-        # What a camera's noise changes is not a thing.
-        weight = ((frames - self.background).abs().amax(1) - NOISE).clamp_min(0.0)
+        weight = self.weight(frames)
         columns, rows = weight.sum(-2), weight.sum(-1)
         mass = rows.sum(-1, keepdim=True).clamp_min(1e-3 * self.axis.numel())  # less than that is nothing: the middle
         x, y = columns @ self.axis[:, None] / mass, rows @ self.axis[:, None] / mass
@@ -330,7 +333,7 @@ class ShapeBearingEncoder(ShapeEncoder):
         self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, velocity_gain: float = 12.0, reach: float = 1.0
     ) -> None:
         super().__init__(4, image_size, pool_to=pool_to, velocity_gain=velocity_gain)
-        _show_bearings(self, _ShapeBearing(pool_to, self.in_channels), latent_dim, reach)
+        _without_weights(self, _ShapeBearing(pool_to, self.in_channels), latent_dim, reach)
         kept = ("image_size", "pool_to", "velocity_gain")
         self.arguments = {"latent_dim": latent_dim, **{k: self.arguments[k] for k in kept}, "reach": float(reach)}
 
@@ -344,10 +347,89 @@ class ShapeBearingEncoder(ShapeEncoder):
         return F.pad(torch.tanh(self.gain * _turned(ahead, away)), (0, self.latent_dim - self.seen_dim))
 
 
-def _show_bearings(encoder: Any, seen: nn.Module, latent_dim: int, reach: float) -> None:
-    """Gives an encoder the latent of two numbers that the data fill, without a weight to train."""
-    if latent_dim < 2 or not reach > 0.0:
-        raise ConfigError(f"expected latent_dim >= 2 and reach > 0, received {latent_dim} and {reach}")
+class _ColouredShape(ShapeMoments):
+    """Shape moments of what has one colour, that of most of what differs from the background."""
+
+    colour: Tensor
+
+    def __init__(self, size: int, channels: int = 3) -> None:
+        super().__init__(size, channels)
+        self.register_buffer("colour", torch.zeros(channels))
+
+    def weight(self, frames: Tensor) -> Tensor:
+        """Share of every pixel that the thing covers, less how far its colour lies off the way from the background to the thing's."""
+        way = self.colour[:, None, None] - self.background
+        length = way.norm(dim=0).clamp_min(NOISE)  # before a background of its own colour a thing is not seen
+        change = frames - self.background
+        along = (change * way).sum(1) / length
+        off = (change.square().sum(1) - along.square()).clamp_min(0.0).sqrt()
+        return ((along - off) / length - NOISE).clamp_min(0.0)
+
+    @torch.no_grad()
+    def fit(self, frames: Tensor) -> None:
+        """Take background, colour and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
+        background = background_of(frames)
+        change = (frames - background).abs().amax(1)
+        whole = change >= WHOLE * change.max()
+        self.colour.copy_(frames.movedim(1, -1)[whole].median(0).values)
+        super().fit(frames)
+
+
+class ShapePlaceEncoder(ShapeEncoder):
+    r"""Where one thing of one colour, with a front and a back, is in the frame, and where it heads; things of other colours do not count.
+
+    .. math:: z_t = \Big(\tanh \frac{c_t}{r}, \; \rho \cos \alpha_t, \; \rho \sin \alpha_t, \; 0\Big) \in [-1, 1]^p, \qquad
+        w = \Big(\frac{\langle f - b, q - b \rangle}{\|q - b\|^2} - \frac{\|(f - b)_\perp\|}{\|q - b\|} - \epsilon\Big)_+
+
+    with the centre c and the direction :math:`\alpha` of :class:`ShapeEncoder`, but of the weights w: how much of a pixel f has gone from
+    the background b to the colour q, less what has gone elsewhere. q is the median of what differs most from the background. A mark of
+    another colour that lies elsewhere in every episode is nothing then. The last two entries are a :class:`~torchrl_sspl.direction.Direction`,
+    for dynamics of this ``turn_radius``. There is no weight to train; :meth:`fit` takes the statistics from frames. Sizes that
+    are not valid are a ConfigError. Source: paper eq. (7); the paper does not give an architecture.
+
+    Args:
+        latent_dim: size p of the latent, at least four.
+        image_size: height and width of the frames in pixels; ``None`` accepts any size.
+        pool_to: height and width after average pooling.
+        velocity_gain: gain k of the difference of the two frames' centres, where the border of the frame cuts the thing.
+        reach: r, in half widths of the frame.
+        turn_radius: :math:`\rho`, latent units; how much a turn counts beside a distance.
+
+    Example:
+        >>> ShapePlaceEncoder(latent_dim=4, image_size=128)(torch.zeros(2, 6, 128, 128, dtype=torch.uint8)).shape
+        torch.Size([2, 4])
+    """
+
+    seen_dim = 4
+
+    def __init__(
+        self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, velocity_gain: float = 12.0, reach: float = 1.0,
+        turn_radius: float = 0.3,
+    ) -> None:  # fmt: skip
+        if not 0.0 < turn_radius <= 1.0:
+            raise ConfigError(f"expected turn_radius in (0, 1], received {turn_radius!r}")
+        super().__init__(max(4, latent_dim), image_size, pool_to=pool_to, velocity_gain=velocity_gain)
+        _without_weights(self, _ColouredShape(pool_to, self.in_channels), latent_dim, reach)
+        self.turn_radius = float(turn_radius)
+        kept = ("image_size", "pool_to", "velocity_gain")
+        self.arguments = {"latent_dim": latent_dim, **{k: self.arguments[k] for k in kept}, "reach": float(reach), "turn_radius": self.turn_radius}
+
+    def _weight(self) -> Tensor:
+        return self.gain
+
+    def head(self, previous: Tensor, current: Tensor) -> Tensor:
+        """Latent from the moments of two successive frames; see :meth:`FrameEncoder.head`."""
+        moments: Any = self.trunk[0]
+        ahead, place = self.ahead(previous, current), current[..., :2] * moments.scale[:2]
+        angle = torch.atan2(ahead[..., 1:], ahead[..., :1])
+        seen = [torch.tanh(self.gain * place), self.turn_radius * angle.cos(), self.turn_radius * angle.sin()]
+        return F.pad(torch.cat(seen, -1), (0, self.latent_dim - self.seen_dim))
+
+
+def _without_weights(encoder: Any, seen: nn.Module, latent_dim: int, reach: float) -> None:
+    """Gives an encoder the latent of what the data fill, without a weight to train."""
+    if latent_dim < encoder.seen_dim or not reach > 0.0:
+        raise ConfigError(f"expected latent_dim >= {encoder.seen_dim} and reach > 0, received {latent_dim} and {reach}")
     encoder.latent_dim, encoder.reach = latent_dim, float(reach)
     encoder.trunk, encoder.latent_head = nn.Sequential(seen), nn.Sequential()
     encoder.gain.data.fill_(1.0 / encoder.reach)
@@ -510,7 +592,7 @@ class BearingEncoder(MomentEncoder):
         self, latent_dim: int, image_size: int | None = None, *, pool_to: int = 64, reach: float = 0.625
     ) -> None:
         super().__init__(self.seen_dim, image_size, pool_to=pool_to)
-        _show_bearings(self, Bearing(pool_to, self.in_channels), latent_dim, reach)
+        _without_weights(self, Bearing(pool_to, self.in_channels), latent_dim, reach)
         self.features = 4
         self.arguments = {"latent_dim": latent_dim, "image_size": self.arguments["image_size"], "pool_to": pool_to, "reach": float(reach)}
 

@@ -39,7 +39,6 @@ _SPREADS = (1.0, 0.75, 0.5, 0.25, 0.0)  # shares of the errors that are tolerate
 _KEPT_OF_SAFE = 0.9
 _ROOM = 1.25  # of what is to be tolerated, that the invariant set of the data tolerates
 _GRID_ROOM = 4.0  # ... that the one on a grid tolerates
-_TURNS = 32  # nodes of the grid around a direction
 _MEMORY = 17  # ... per entry that no picture shows, on the finer grid
 _SEPARATE = 8000  # steps in which U is told from the rest: a border that is not sharp costs volume
 _UNSAFE_FIRST = 3.0  # how much more a picture of U counts there
@@ -203,7 +202,7 @@ def _grid_targets(work: Workspace, z: Tensor, unsafe: Tensor, queries: Tensor) -
     looks_unsafe, room = z[unsafe][:, :seen], max(s.guard, 1.0 / (s.grid - 1))  # at least half of a cell
     low, sizes, period = [-1.0] * seen, [s.grid] * seen, [0.0] * seen
     if turns is not None:  # the grid is one of charts
-        low, sizes, period = low[:-1], [*sizes[:-2], _TURNS], [0.0] * (seen - 1)
+        low, sizes, period = low[:-1], [*sizes[:-2], s.turns], [0.0] * (seen - 1)
         low[-1], period[-1] = -math.pi * turns.radius, 2.0 * math.pi * turns.radius
     signs = torch.cartesian_prod(*[torch.tensor([-1.0, 0.0, 1.0])] * len(low)).reshape(-1, len(low))
     if len(low) > 2:  # the ends of the axes and the corners

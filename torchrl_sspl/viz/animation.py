@@ -59,10 +59,11 @@ class Take:
 
 @dataclass
 class Scene:
-    """A title, and one or two takes from the same start, the agent's last. Source: none."""
+    """A title, and one or two takes from the same start, the agent's last; levels of its own in place of the film's. Source: none."""
 
     title: str
     takes: list[Take]
+    levels: tuple[Any, dict[str, Any]] | None = None
 
 
 def animate(
@@ -95,7 +96,7 @@ def animate(
     if path.suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         warnings.warn("imageio-ffmpeg is not installed; the film becomes a gif.", stacklevel=2)
         path = path.with_suffix(".gif")
-    images = itertools.chain.from_iterable(_Drawing(scene, plane, levels, value_name, fps).images() for scene in scenes)
+    images = itertools.chain.from_iterable(_Drawing(scene, plane, scene.levels or levels, value_name, fps).images() for scene in scenes)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
         _write_mp4(path, _with_poster(images, path.with_suffix(".jpg"), fps), fps)

@@ -223,7 +223,7 @@ def file_uri(path: str | Path) -> str:
     return _data_uri(path.read_bytes(), mime)
 
 
-def _film(path: Path, caption: str) -> Picture:
+def film_picture(path: Path, caption: str) -> Picture:
     """A film; a picture beside it of the same name, ending in .jpg, is shown before it begins."""
     poster = path.with_suffix(".jpg")
     return Picture(file_uri(path), caption, caption, poster=file_uri(poster) if poster.is_file() else "")
@@ -347,7 +347,7 @@ def write_report(
     lists = (proved, measured or _measured_lines(summary, data), _ASSUMED if assumed is None else assumed)
     page = render(
         "report.html", title=title, facts=" / ".join(_facts(config)), headline=first, kind=kind, mark=MARKS[kind], more=more,
-        columns=_columns(lists), kernel=kernel, film=None if video is None else _film(Path(video), video_caption),
+        columns=_columns(lists), kernel=kernel, film=None if video is None else film_picture(Path(video), video_caption),
         requirements=requirements, certificate=certificate or "", notes=_paragraphs(notes),
         figures=[figure_picture(n, f) for n, f in (figures or {}).items()], checks=_sizes(checks) if checks else None,
         measurements=_measurements(data) if data else None, configuration=_configuration(config) if config else None,
