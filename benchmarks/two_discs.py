@@ -24,6 +24,7 @@ from torchrl_sspl.baselines.data import pooled, record
 from torchrl_sspl.certification.statistics import clopper_pearson
 from torchrl_sspl.envs.two_discs import DISCS, GOAL, RADIUS, CMUTwoDiscsEnv
 from torchrl_sspl.evaluation import simulate
+from torchrl_sspl.evaluation.controllers import Camera, Decision
 from torchrl_sspl.evaluation.known import states_where
 from torchrl_sspl.evaluation.simulation import looked_at
 from torchrl_sspl.sets import Box
@@ -44,15 +45,15 @@ class Planner:
 
     def __init__(self, env: CMUTwoDiscsEnv, blind: bool = False, seed: int = SEED) -> None:
         self.env, self.blind = env, blind
-        self.generator, self.plan = torch.Generator().manual_seed(seed), torch.zeros(0)
+        self.generator, self.plans = torch.Generator().manual_seed(seed), torch.zeros(0)
 
-    def __call__(self, state: Tensor) -> Tensor:
-        """The first action of the mean plan."""
-        if len(self.plan) != len(state):
+    def __call__(self, state: Tensor, rows: Tensor) -> Tensor:
+        """The first action of the mean plan, of some of the episodes; of all of them where they begin."""
+        if not len(self.plans):
             off = torch.atan2(state[:, 3] - state[:, 1], GOAL - state[:, 0]) - state[:, 2]
             first = 2.0 * (torch.remainder(off + math.pi, 2 * math.pi) - math.pi)
-            self.plan = first.clamp(-2.0, 2.0)[:, None].repeat(1, AHEAD)
-        n, before = len(state), self.plan[:, None]
+            self.plans = first.clamp(-2.0, 2.0)[:, None].repeat(1, AHEAD)
+        n, before = len(state), self.plans[rows, None]
         noise = SPREAD * torch.randn(n, SAMPLES, AHEAD, generator=self.generator)
         tried = (before + noise).clamp(-self.env.max_action, self.env.max_action)
         at, cost = state[:, None].expand(n, SAMPLES, 4).reshape(-1, 4), torch.zeros(n * SAMPLES)
@@ -68,7 +69,7 @@ class Planner:
         cost = cost.reshape(n, SAMPLES) + EFFORT * tried.square().sum(2) + 0.5 * EFFORT * tried.diff(dim=2).square().sum(2)
         cost += STEADY * (tried - before).square().sum(2)
         plan = (torch.softmax(-cost / TEMPERATURE, 1)[..., None] * tried).sum(1)
-        self.plan = torch.cat([plan[:, 1:], plan[:, -1:]], 1)
+        self.plans[rows] = torch.cat([plan[:, 1:], plan[:, -1:]], 1)
         return plan[:, :1]
 
 
@@ -89,24 +90,46 @@ class Through(SafetyMethod):
         return nominal, torch.zeros(len(seen), dtype=torch.bool)
 
 
-def episodes(method: SafetyMethod, env: CMUTwoDiscsEnv, start: Tensor, nominal: Callable[[Tensor], Tensor]) -> dict[str, Any]:
+class Noted:
+    """A method behind a nominal policy; notes what that wants of every car at every step."""
+
+    reads, streams = "pixels", True
+
+    def __init__(self, method: SafetyMethod, nominal: Callable[[Tensor, Tensor], Tensor], n: int) -> None:
+        self.inner, self.nominal, self.n = method.controller(lambda state: self.now), nominal, n
+        self.wanted: list[Tensor] = []
+
+    def reset(self, rows: Tensor | None = None) -> None:
+        """Forgets what belongs to episodes."""
+        self.inner.reset(rows)
+
+    def watch(self, camera: Camera, rows: Tensor | None = None) -> Decision:
+        """Nothing is decided about the last observation."""
+        return Decision()
+
+    def step(self, camera: Camera, rows: Tensor | None = None) -> Decision:
+        """What the method makes of what is wanted."""
+        index = torch.arange(self.n) if rows is None else rows
+        self.now = self.nominal(camera.state, index)
+        self.wanted.append(torch.zeros(self.n).index_copy(0, index, self.now[:, 0]))
+        return self.inner.step(camera, rows)
+
+
+def episodes(method: SafetyMethod, env: CMUTwoDiscsEnv, start: Tensor, nominal: Callable[[Tensor, Tensor], Tensor]) -> dict[str, Any]:
     """What happens from states ``(n, 4)``: shares of the episodes, and means over their steps."""
-    wanted: list[Tensor] = []
-
-    def noted(state: Tensor) -> Tensor:
-        wanted.append(nominal(state))
-        return wanted[-1]
-
+    acts = Noted(method, nominal, len(start))
     draw = (lambda state: pooled(env.draw(state), SIZE)) if method.pools else env.draw
-    run = simulate(method.controller(noted), env, start=start, horizon=HORIZON, draw=draw)
+    run = simulate(acts, env, start=start, horizon=HORIZON, draw=draw)
     assert run.states is not None
     there = env.reached(run.states)
     alive = looked_at(run, env) & (there.cumsum(0) - there.int() == 0)  # until the goal is reached, that moment included
     hit = (env.unsafe_set.contains(run.states) & alive).any(0)
     reached = (there & alive).any(0)
     steps = alive[1:]  # a step counts where it led to something
-    off = (run.actions[..., 0] - torch.stack(wanted)[..., 0]).abs()
-    turn, both = run.actions[..., 0].diff(dim=0).abs(), steps[1:]
+    taken, wanted = run.actions[..., 0], torch.stack(acts.wanted)
+    off = torch.zeros_like(taken)
+    off[: len(wanted)] = (taken[: len(wanted)] - wanted[: len(taken)]).abs()  # when all are gone nothing is wanted any more
+    turn, both = taken.diff(dim=0).abs(), steps[1:]
     return {
         "episodes": len(start), "collisions": int(hit.sum()), "bounds": clopper_pearson(int(hit.sum()), len(start)),
         "reached without a collision": int((reached & ~hit).sum()), "left": int((~hit & ~reached & ~looked_at(run, env)[-1]).sum()),
