@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from torchrl_sspl.envs import DubinsEnv, GymnasiumRenderer, PendulumEnv, Requirement, System
+from torchrl_sspl.envs import CMUTwoDiscsEnv, DubinsEnv, GymnasiumRenderer, PendulumEnv, Requirement, System
 from torchrl_sspl.envs.dubins import YAW_LAG
 from torchrl_sspl.errors import MissingDependencyError
 
@@ -31,7 +31,7 @@ def test_a_requirement_of_which_nothing_was_said_is_not_measured():
     assert Requirement("x", "share", "<=", 0.0, 0.0).verdict(measured()) == "not measured"
 
 
-@pytest.mark.parametrize("env", [PendulumEnv(), DubinsEnv(image_size=32), DubinsEnv(image_size=32, yaw_lag=YAW_LAG)])
+@pytest.mark.parametrize("env", [PendulumEnv(), DubinsEnv(image_size=32), DubinsEnv(image_size=32, yaw_lag=YAW_LAG), CMUTwoDiscsEnv(image_size=32)])
 def test_a_system_names_every_coordinate_and_sizes_every_grid(env):
     system = env.system
     assert len(system.state_names) == env.state_dim

@@ -11,8 +11,8 @@ from torch import nn
 from torch.nn import functional as F
 
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
-from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
+from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError
 from torchrl_sspl.modules import (
     BearingEncoder,

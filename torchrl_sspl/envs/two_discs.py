@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv, check_tensor
 from torchrl_sspl.envs.cmu_dubins import Stays
-from torchrl_sspl.envs.dubins import Disc
-from torchrl_sspl.envs.system import Requirement, System
+from torchrl_sspl.envs.dubins import Disc, ThereAndBack
+from torchrl_sspl.envs.system import Opening, Requirement, System
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.sets import SAFE, Box, Region, Union
 
@@ -100,6 +100,14 @@ class CMUTwoDiscsEnv(SafetyEnv):
             state_grid=(61, 61, 37, 3),
             kernel_grid=(101, 101, 72, 2),
             unsafe_grid=(61, 61, 36, 3),
+            openings=tuple(
+                Opening(title, (*start, goal), partial(ThereAndBack, [(GOAL, goal)], YAW_RATE))
+                for title, start, goal in (
+                    ("A goal behind the upper disc", (-1.2, 0.65, 0.0), 0.5),
+                    ("A goal behind the gap", (-1.2, -0.25, 0.0), 0.0),
+                    ("Between disc and border", (-1.2, -1.0, 0.0), -0.6),
+                )
+            ),
             notes=("The gap between the discs is 0.3 m wide: on the grid of the true kernel ten nodes.",),
         )
 
