@@ -219,3 +219,9 @@ def test_the_same_seed_gives_the_same_mixture():
 def test_shares_that_make_no_sense_are_an_error(wrong):
     with pytest.raises(ConfigError, match="one share >= 0 for each of 2 regions"):
         Mixture([Box([0.0], [1.0]), Box([2.0], [3.0])], wrong)
+
+
+def test_a_union_has_the_box_around_its_parts():
+    both = Box([0.0, -1.0], [1.0, 0.0]) | Box([2.0, -3.0], [3.0, -2.0])
+    assert both.low.tolist() == [0.0, -3.0]
+    assert both.high.tolist() == [3.0, 0.0]

@@ -180,6 +180,16 @@ class Union(Region):
             raise ConfigError("expected at least one set to unite, received none; pass the sets as arguments")
         self.parts, self.dim = parts, _common_dim(*parts)
 
+    @property
+    def low(self) -> Tensor:
+        """Lower corner ``(dim,)`` of the box around all parts, of parts that have one."""
+        return torch.stack([part.low for part in self.parts]).amin(0)  # type: ignore[attr-defined]
+
+    @property
+    def high(self) -> Tensor:
+        """Upper corner ``(dim,)``, likewise."""
+        return torch.stack([part.high for part in self.parts]).amax(0)  # type: ignore[attr-defined]
+
     def contains(self, state: Tensor) -> Tensor:
         """Whether states are in any of the sets."""
         return torch.stack([p.contains(state) for p in self.parts]).any(0)

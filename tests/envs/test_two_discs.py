@@ -10,9 +10,12 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_sspl.configs import compose
+from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.envs import CMUTwoDiscsEnv
 from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.evaluation import evaluate
 from torchrl_sspl.experiments import Experiment
+from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 from torchrl_sspl.viability import viability_kernel
 
@@ -129,8 +132,12 @@ def test_a_size_that_is_none_is_refused():
         CMUTwoDiscsEnv(image_size=0)
 
 
-def test_the_recommended_settings_begin_a_training(tmp_path):
+def test_the_recommended_settings_begin_a_training_and_its_agents_are_measured(tmp_path):
     config = compose(["env=two_discs", "env.image_size=32", "network.pool_to=32", "preset=smoke", "logger=none", f"out_dir={tmp_path}"])
     experiment = Experiment(config)
     assert isinstance(experiment.env, CMUTwoDiscsEnv)
     assert experiment.dynamics.direction is not None  # the last two entries of the latent are one
+    experiment.encoder.fit(experiment.env.draw(experiment.env.sample_states(20)))
+    found = evaluate(Agent.from_loss(experiment.loss), experiment.env, EvaluationConfig(grid=7, kernel_grid=9, episodes=4, horizon=3))
+    assert found["volume_over_kernel"] is not None
+    assert found.measurements["unsafe_called_safe"].n > 20  # a grid over both discs
