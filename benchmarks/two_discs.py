@@ -1,6 +1,6 @@
 r"""CMU's car between two discs: a nominal policy heads for the goal, alone and behind filters that see pictures.
 
-Run: python benchmarks/two_discs.py RUN_OR_AGENT [RUN_OR_AGENT ...] [--episodes N] [--seed S] [--budget small] [--level L] [--out FILE]
+Run: python benchmarks/two_discs.py RUN_OR_AGENT [RUN_OR_AGENT ...] [--episodes N] [--seed S] [--budget small] [--rivals NAMES] [--level L] [--out FILE]
 Prints tables in Markdown and writes one JSON. The nominal policy is sampling-based (MPPI, with the weights of the public code of latent_cbf), which
 knows state, goal and discs, but looks only 0.4 m ahead; *blind* is the same without the discs. Episodes start as theirs do, at the left, at states of
 the true kernel, and end at the goal, outside the arena or after 200 steps. The rivals learn from ``--budget`` transitions, with the encoder that
@@ -32,6 +32,7 @@ from torchrl_sspl.viability import ViabilityKernel, viability_kernel
 
 SEED, HORIZON, SIZE = 20261126, 200, 64
 STARTS = Box([-1.5, -1.0, -math.pi / 3, -0.6], [-1.0, 1.0, math.pi / 3, 0.6])
+RIVALS = "latent_safe,latent_safe:threshold=0.1,latent_safe:threshold=0.2,smooth_latent,smooth_latent:keep=0.5"
 SAMPLES, AHEAD, SPREAD, TEMPERATURE = 500, 8, math.sqrt(3.0), 3.0
 TO_GOAL, TO_DISC, EFFORT, STEADY, MARGIN = 10.0, 10.0, 0.01, 0.2, 0.05
 
@@ -150,6 +151,7 @@ def main() -> None:
     asked.add_argument("--episodes", type=int, default=400)
     asked.add_argument("--seed", type=int, default=0, help="of the rivals' training")
     asked.add_argument("--budget", default="small", help="of the rivals; none: without them")
+    asked.add_argument("--rivals", default=RIVALS, help="NAME or NAME:key=value, separated by commas")
     asked.add_argument("--level", type=float, action="append", help="of the agents' filter; may be given again")
     asked.add_argument("--out", default="two_discs.json")
     given = asked.parse_args()
@@ -161,10 +163,11 @@ def main() -> None:
     methods: dict[str, SafetyMethod] = {"none": Through(), "true kernel, true state": perfect}
     if given.budget != "none":
         data = record(env, BUDGETS[given.budget], given.seed, size=SIZE)
-        for name in ("latent_safe", "smooth_latent"):
-            methods[name] = make(name)
+        for rival in given.rivals.split(","):
+            name, *options = rival.split(":")
+            methods[rival] = make(name, options)
             torch.manual_seed(given.seed)
-            methods[name].fit(data, env, BUDGETS[given.budget], given.seed)
+            methods[rival].fit(data, env, BUDGETS[given.budget], given.seed)
     perfect.fit(None, env, BUDGETS["tiny"], 0)
     for agent in given.agents:
         for level in given.level or (0.0,):
