@@ -293,7 +293,7 @@ def test_quadrupeds_agent_answers_from_the_gpu():
 
 
 def test_certificates_say_the_same_of_an_agent_on_the_gpu(pair):
-    short = {"level": 0.0, "horizon": 5, "budget": Budget(boxes=10_000)}
+    short = {"level": 0.0, "horizon": 5, "budget": Budget(boxes=2_000)}
     here, there = (certify(agent, PendulumEnv(batch_size=[1]), episodes=20, **short) for agent in pair)
     resets = certify_on_episodes(pair[1], PendulumEnv, episodes=20, envs=10, **short)
     assert here.weights == there.weights == resets.weights

@@ -432,6 +432,14 @@ def test_a_loss_that_is_not_finite_stops_the_phase():
         loop(5, {layer: 1e-3}, lambda: TensorDict(loss_bad=layer.weight.sum() * float("nan")))
 
 
+def test_what_a_loss_that_is_not_finite_has_made_is_not_saved():
+    layer, loop, saved = nn.Linear(1, 1), InnerLoop(seed=0), []
+    loop.tick = lambda: saved.append(loop.state_dict()["step"])  # a checkpoint after every step
+    with pytest.raises(ConfigError, match=r"expected finite losses, received .* in step 3;"):
+        loop(5, {layer: 1e-3}, lambda: TensorDict(loss_bad=layer.weight.sum() * (float("nan") if loop.step == 2 else 1.0)))
+    assert saved == [1, 2]
+
+
 @pytest.mark.parametrize(("dimensions", "per_dimension"), [(1, 21), (2, 21), (4, 7), (8, 7)])
 def test_the_grid_of_actions_gets_coarser_with_their_dimension(dimensions, per_dimension):
     grid = action_grid([1.0] * dimensions, per_dimension)

@@ -73,6 +73,7 @@ class InnerLoop:
         self.loss: float | None = None  # of the last row in the log, for people
         self._live: tuple[Any, Any] | None = None
         self._saved: dict[str, Any] | None = None
+        self._terms: Any = {}  # of the last step
 
     def pick(self, n: int, size: int) -> Tensor:
         """``(size,)`` rows of n, drawn uniformly."""
@@ -110,24 +111,32 @@ class InnerLoop:
             adam.step()
             cycle.step()
             self.step += 1
+            self._terms = terms
             if self.step % 100 == 0 or self.step == steps:
-                row = {k: float(v.detach()) for k, v in terms.items()}
-                if not all(map(math.isfinite, row.values())):
-                    raise ConfigError(
-                        f"expected finite losses, received {row} in step {self.step}; lower synthesis.lr, or take another "
-                        "seed, in another out_dir"
-                    )
+                row = self._row()
                 self.loss = sum(v for k, v in row.items() if k.startswith("loss"))
                 self.log({"step": self.step, **row})
             self.tick()
         self._live = None
 
+    def _row(self) -> dict[str, float]:
+        """The terms of the last step as numbers; a ConfigError if one is not finite."""
+        row = {k: float(v.detach()) for k, v in self._terms.items()}
+        if not all(map(math.isfinite, row.values())):
+            raise ConfigError(
+                f"expected finite losses, received {row} in step {self.step}; lower synthesis.lr, or take another "
+                "seed, in another out_dir"
+            )
+        return row
+
     def restart(self) -> None:
         """For the next phase."""
-        self.step, self._live, self._saved, self.loss = 0, None, None, None
+        self.step, self._live, self._saved, self.loss, self._terms = 0, None, None, None, {}
 
     def state_dict(self) -> dict[str, Any]:
-        """Step, generators, and the optimiser's state inside a phase."""
+        """Step, generators, and the optimiser's state inside a phase; a ConfigError if the last loss was not finite: that is not worth keeping."""
+        if self._live is not None:
+            self._row()
         state: dict[str, Any] = {"step": self.step, "generator": self.generator.get_state(), "inside": self._live is not None}
         if self._live is not None:
             adam, cycle = self._live
