@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.baselines import BUDGETS, SafetyMethod, make
-from torchrl_sspl.baselines.data import pooled, record
+from torchrl_sspl.baselines.data import record
 from torchrl_sspl.certification.statistics import clopper_pearson
 from torchrl_sspl.envs.two_discs import DISCS, GOAL, RADIUS, CMUTwoDiscsEnv
 from torchrl_sspl.evaluation import simulate
@@ -119,8 +119,7 @@ class Noted:
 def episodes(method: SafetyMethod, env: CMUTwoDiscsEnv, start: Tensor, nominal: Callable[[Tensor, Tensor], Tensor]) -> dict[str, Any]:
     """What happens from states ``(n, 4)``: shares of the episodes, and means over their steps."""
     acts = Noted(method, nominal, len(start))
-    draw = (lambda state: pooled(env.draw(state), SIZE)) if method.pools else env.draw
-    run = simulate(acts, env, start=start, horizon=HORIZON, draw=draw)
+    run = simulate(acts, env, start=start, horizon=HORIZON)
     assert run.states is not None
     there = env.reached(run.states)
     alive = looked_at(run, env) & (there.cumsum(0) - there.int() == 0)  # until the goal is reached, that moment included
@@ -177,17 +176,11 @@ def main() -> None:
     print("| filter | nominal | collisions | at the goal without one | left | steps changed | deviation [rad/s] | change of u [rad/s a step] | claimed at the start, and of these collide |")
     print("|" + "---|" * 9)
     for name, method in methods.items():
-        small = method.pools and method.reads == "pixels"
-        value = None
-        if method.reads == "state":
-            value = method.barrier(start)
-        else:
-            parts = [env.observe(part) for part in start.split(64)]
-            value = torch.cat([b for p in parts if (b := method.barrier(pooled(p, SIZE) if small else p)) is not None])
+        parts = [start] if method.reads == "state" else [env.observe(part) for part in start.split(64)]
+        claimed = None if (claims := [method.claims(part) for part in parts])[0] is None else torch.cat(claims)
         for label in ("MPPI", "blind MPPI"):
             found = episodes(method, env, start, Planner(env, blind=label != "MPPI"))
             hit = torch.tensor(found.pop("hit"))
-            claimed = None if value is None else value <= 0
             found |= {"claimed": None if claimed is None else int(claimed.sum()), "of these collide": None if claimed is None else int((claimed & hit).sum())}
             body.setdefault(name, {})[label] = found
             n = found["episodes"]

@@ -38,7 +38,7 @@ def test_pendulum_kernels_have_their_known_volumes(parameters, known):
 
 @pytest.mark.slow
 def test_the_pendulum_kernel_converges_with_the_grid():
-    volumes = [viability_kernel(PendulumEnv(), resolution=n).volume_fraction for n in (101, 201, 301)]
+    volumes = [viability_kernel(PendulumEnv(), resolution=n).volume_fraction for n in (101, 201, 401)]
     assert max(volumes) - min(volumes) < 0.005
 
 

@@ -62,7 +62,7 @@ class LatentSafe(SafetyMethod):
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """World model, margin, value, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
-        self.env, self.size = env, data.frames.shape[-1]
+        self.env = env
         failed = data.region == UNSAFE
         self._world(data, torch.where(failed, UNSAFE, SAFE), seed)
         with torch.no_grad():
@@ -134,7 +134,7 @@ class LatentSafe(SafetyMethod):
 
     @torch.no_grad()
     def _q(self, seen: Tensor) -> Tensor:
-        return self.value(self.encoder(pooled(seen, self.size)))
+        return self.value(self.encoder(pooled(seen, self.encoder.pool_to[0])))
 
     def barrier(self, seen: Tensor) -> Tensor | None:
         """Minus the value of the best action, raised by the threshold; zero does not count as safe."""

@@ -93,17 +93,22 @@ def failures(cells: Sequence[Cell], path: Path) -> Path | None:
 
     Shown is an episode from a start that could be kept safe, if there is one, up to half a second in U. Source: none.
     """
-    found = [(title, kept) for title, kept in _first(cells).items() if any(f"failed_{n}" in np.load(kept) for n in NOMINALS)]
+    found = [(title.replace("\n", ", "), nominal, kept) for title, kept in _first(cells).items() if (nominal := _failed_under(kept))]
     if not found:
         return None
     env = cells[0].environment()
-    scenes = (_failure(env, title.replace("\n", ", "), kept) for title, kept in found)
+    scenes = (_failure(env, *of) for of in found)
     return animate(scenes, path, plane=Plane.of(env, env.system.state_names[:2]), fps=round(1 / env.dt))  # type: ignore[arg-type, attr-defined]
 
 
-def _failure(env: Any, title: str, path: Path) -> Scene:
+def _failed_under(path: Path) -> str:
+    """The first nominal policy under which a method failed, "" for none."""
     with np.load(path) as body:
-        nominal = next(n for n in NOMINALS if f"failed_{n}" in body)
+        return next((n for n in NOMINALS if f"failed_{n}" in body), "")
+
+
+def _failure(env: Any, title: str, nominal: str, path: Path) -> Scene:
+    with np.load(path) as body:
         states, grid, viable = (torch.from_numpy(body[name]) for name in (f"failed_{nominal}", "states", "viable"))
         levels = grid.numpy(), {"B": body["claimed"], "kernel": body["viable"]}
     unsafe = env.unsafe_set.contains(states)

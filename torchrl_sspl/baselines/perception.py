@@ -133,7 +133,7 @@ class Perception(nn.Module):
     @torch.no_grad()
     def forward(self, pixels: Tensor) -> Tensor:
         """States ``(n, s)`` of observations ``(n, 6, H, W)`` uint8."""
-        return self.at.state(self.encoder(pooled(pixels)))
+        return self.at.state(self.encoder(pooled(pixels, self.encoder.pool_to[0])))
 
 
 def perception_error(told: Tensor, state: Tensor, env: SafetyEnv) -> dict[str, float]:

@@ -114,7 +114,7 @@ def table(words: Sequence[str]) -> list[tuple[Cell, Row]]:
     asked, measure, found = cells([f"{k}={v}" for k, v in given.items()]), partial(_row, run=run == "true"), list[tuple[Cell, Row]]()
     with ExitStack() as stack:
         rows: Iterable[Row] = map(measure, asked)
-        if int(jobs) > 1:
+        if run == "true" and int(jobs) > 1:
             rows = stack.enter_context(ProcessPoolExecutor(int(jobs), get_context("spawn"))).map(measure, asked)
         for cell, row in zip(asked, rows, strict=True):
             found.append((cell, row))

@@ -29,9 +29,9 @@ _LEAST = {
     "evaluation.kernel_grid evaluation.certificate_episodes evaluation.certificate_seconds synthesis.steady_steps synthesis.dynamics_steps "
     "synthesis.teach_steps synthesis.fit_steps synthesis.steer_steps synthesis.tune_steps synthesis.tighten_steps synthesis.dynamics_outlier "
     "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices",
-    4: "synthesis.turns",
     1: "evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.batch synthesis.residuals synthesis.actions "
     "synthesis.rim_draws synthesis.check_episodes synthesis.check_horizon",
+    4: "synthesis.turns",
 }
 
 

@@ -65,6 +65,8 @@ class CMUTwoDiscsEnv(SafetyEnv):
         torch.Size([1, 6, 128, 128])
     """
 
+    dt = STEP
+
     def __init__(
         self,
         batch_size: Sequence[int] = (1,),

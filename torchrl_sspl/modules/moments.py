@@ -196,6 +196,9 @@ class ShapeMoments(nn.Module):
         self.register_buffer("scale", torch.ones(5))
         self.register_buffer("axis", (torch.arange(size) + 0.5) / size * 2 - 1, persistent=False)
 
+    def notice(self, frames: Tensor) -> None:
+        """What is to be known of frames, beside their background, before moments are taken; nothing here."""
+
     def weight(self, frames: Tensor) -> Tensor:
         """How much of the thing every pixel shows, ``(n, H, W)``; what a camera's noise changes is not a thing."""
         return ((frames - self.background).abs().amax(1) - NOISE).clamp_min(0.0)
@@ -220,6 +223,7 @@ class ShapeMoments(nn.Module):
     def fit(self, frames: Tensor) -> None:
         """Take background and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
         self.background.copy_(background_of(frames))
+        self.notice(frames)
         found = in_parts(self.moments, frames)
         # One scale for both directions: turning the frame turns what is seen.
         pairs = found[:, :4].unflatten(-1, (2, 2)).square().mean((0, 2)).sqrt()
@@ -365,14 +369,11 @@ class _ColouredShape(ShapeMoments):
         off = (change.square().sum(1) - along.square()).clamp_min(0.0).sqrt()
         return ((along - off) / length - NOISE).clamp_min(0.0)
 
-    @torch.no_grad()
-    def fit(self, frames: Tensor) -> None:
-        """Take background, colour and scales from frames ``(n, c, H, W)``; fewer than ten are an EmptyRegionError."""
-        background = background_of(frames)
-        change = (frames - background).abs().amax(1)
+    def notice(self, frames: Tensor) -> None:
+        """The colour, from the pixels of frames ``(n, c, H, W)`` that differ most from the background."""
+        change = (frames - self.background).abs().amax(1)
         whole = change >= WHOLE * change.max()
         self.colour.copy_(frames.movedim(1, -1)[whole].median(0).values)
-        super().fit(frames)
 
 
 class ShapePlaceEncoder(ShapeEncoder):

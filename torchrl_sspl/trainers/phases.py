@@ -73,7 +73,7 @@ class InnerLoop:
         self.loss: float | None = None  # of the last row in the log, for people
         self._live: tuple[Any, Any] | None = None
         self._saved: dict[str, Any] | None = None
-        self._terms: Any = {}  # of the last step
+        self._terms: dict[str, Tensor] = {}  # of the last step
 
     def pick(self, n: int, size: int) -> Tensor:
         """``(size,)`` rows of n, drawn uniformly."""
@@ -111,7 +111,7 @@ class InnerLoop:
             adam.step()
             cycle.step()
             self.step += 1
-            self._terms = terms
+            self._terms = {k: v.detach() for k, v in terms.items()}
             if self.step % 100 == 0 or self.step == steps:
                 row = self._row()
                 self.loss = sum(v for k, v in row.items() if k.startswith("loss"))
@@ -121,7 +121,7 @@ class InnerLoop:
 
     def _row(self) -> dict[str, float]:
         """The terms of the last step as numbers; a ConfigError if one is not finite."""
-        row = {k: float(v.detach()) for k, v in self._terms.items()}
+        row = {k: float(v) for k, v in self._terms.items()}
         if not all(map(math.isfinite, row.values())):
             raise ConfigError(
                 f"expected finite losses, received {row} in step {self.step}; lower synthesis.lr, or take another "
@@ -135,10 +135,9 @@ class InnerLoop:
 
     def state_dict(self) -> dict[str, Any]:
         """Step, generators, and the optimiser's state inside a phase; a ConfigError if the last loss was not finite: that is not worth keeping."""
-        if self._live is not None:
-            self._row()
         state: dict[str, Any] = {"step": self.step, "generator": self.generator.get_state(), "inside": self._live is not None}
         if self._live is not None:
+            self._row()
             adam, cycle = self._live
             # OneCycleLR keeps a bound method.
             schedule = {k: v for k, v in cycle.state_dict().items() if not callable(v)}
