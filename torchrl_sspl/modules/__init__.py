@@ -7,14 +7,12 @@ from torchrl_sspl.modules.contrast import ContrastEncoder
 from torchrl_sspl.modules.moments import (
     BearingEncoder,
     MomentEncoder,
-    ShapeBearingEncoder,
-    ShapeEncoder,
-    ShapePlaceEncoder,
     TurnedBearingEncoder,
 )
 from torchrl_sspl.modules.networks import FrameEncoder, InverseDynamics, LatentDynamics, Policy, inward_clamp
 from torchrl_sspl.modules.observer import LatentObserver, Predict
 from torchrl_sspl.modules.salad import SaLaD, as_tensordict_module, make_rollout_policy
+from torchrl_sspl.modules.shapes import ShapeBearingEncoder, ShapeEncoder, ShapePlaceEncoder
 
 __all__ = [
     "BearingEncoder",

@@ -29,13 +29,11 @@ from torchrl_sspl.modules.export import export
 from torchrl_sspl.modules.moments import (
     BearingEncoder,
     MomentEncoder,
-    ShapeBearingEncoder,
-    ShapeEncoder,
-    ShapePlaceEncoder,
     TurnedBearingEncoder,
 )
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
 from torchrl_sspl.modules.observer import gain_matrix
+from torchrl_sspl.modules.shapes import ShapeBearingEncoder, ShapeEncoder, ShapePlaceEncoder
 
 WEIGHTS_FILE = "agent.safetensors"
 DESCRIPTION_FILE = "agent.json"
