@@ -22,6 +22,7 @@ from torch import Tensor
 from torchrl_sspl.baselines import BUDGETS, SafetyMethod, make
 from torchrl_sspl.baselines.data import record
 from torchrl_sspl.certification.statistics import clopper_pearson
+from torchrl_sspl.envs.base import wrapped
 from torchrl_sspl.envs.two_discs import DISCS, GOAL, RADIUS, CMUTwoDiscsEnv
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.evaluation.controllers import Camera, Decision
@@ -52,8 +53,7 @@ class Planner:
         """The first action of the mean plan, of some of the episodes; of all of them where they begin."""
         if not len(self.plans):
             off = torch.atan2(state[:, 3] - state[:, 1], GOAL - state[:, 0]) - state[:, 2]
-            first = 2.0 * (torch.remainder(off + math.pi, 2 * math.pi) - math.pi)
-            self.plans = first.clamp(-2.0, 2.0)[:, None].repeat(1, AHEAD)
+            self.plans = (2.0 * wrapped(off)).clamp(-2.0, 2.0)[:, None].repeat(1, AHEAD)
         n, before = len(state), self.plans[rows, None]
         noise = SPREAD * torch.randn(n, SAMPLES, AHEAD, generator=self.generator)
         tried = (before + noise).clamp(-self.env.max_action, self.env.max_action)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 
 import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.baselines.data import POOL, Recording, pooled
-from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.base import SafetyEnv, wrapped
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
@@ -145,7 +144,7 @@ def perception_error(told: Tensor, state: Tensor, env: SafetyEnv) -> dict[str, f
     """
     off = told - state
     turn = getattr(env.state_space, "period", torch.zeros(env.state_dim))
-    off = torch.where(turn > 0, torch.remainder(off + math.pi, 2 * math.pi) - math.pi, off).abs()
+    off = torch.where(turn > 0, wrapped(off), off).abs()
     return {f"x{k}_q{int(100 * q)}": float(off[:, k].quantile(q)) for k in range(off.shape[1]) for q in (0.5, 0.99)}
 
 

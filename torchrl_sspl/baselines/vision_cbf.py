@@ -10,7 +10,6 @@ plain regression.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -22,7 +21,7 @@ from torchrl_sspl.baselines.base import Budget, Needs, OneStepFilter
 from torchrl_sspl.baselines.ceilings import collision_cone, higher_order
 from torchrl_sspl.baselines.data import POOL, Recording, pooled
 from torchrl_sspl.baselines.perception import perception_error, train
-from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.base import SafetyEnv, wrapped
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.errors import ConfigError
@@ -89,7 +88,7 @@ class Geometry:
         if self.pendulum:
             old, new = self.centre(picture[:, 0]), self.centre(picture[:, 1])
             before, now = torch.atan2(-old[:, 0], -old[:, 1]), torch.atan2(-new[:, 0], -new[:, 1])
-            moved = torch.remainder(now - before + math.pi, 2 * math.pi) - math.pi
+            moved = wrapped(now - before)
             return torch.stack([now, moved / self.env.dt], -1)
         place = self.centre(picture[:, 2]) * torch.tensor([1.0, -1.0]) * 1.2 * self.env.arena_half_size
         cos, sin = (picture[:, k] * picture[:, 2].clamp_min(0) for k in (3, 4))

@@ -44,6 +44,11 @@ def check_positive(**values: float) -> None:
             raise ConfigError(f"{name}: expected a positive finite number, received {value!r}.")
 
 
+def wrapped(angle: Tensor) -> Tensor:
+    """Angles in [-pi, pi), same shape."""
+    return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
+
+
 def set_specs(env: EnvBase, image_size: int, state_dim: int, bound: Tensor) -> None:
     """Give an environment of stacked frames its specs; actions are within ``bound``, ``(action_dim,)``, of zero."""
     shape, device = env.batch_size, env.device

@@ -12,7 +12,7 @@ import gymnasium
 import torch
 from torch import Tensor
 
-from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
+from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor, wrapped
 from torchrl_sspl.envs.quadruped.compositor import TopViewCompositor
 from torchrl_sspl.envs.system import Opening, Requirement, System
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
@@ -320,7 +320,7 @@ class DubinsEnv(SafetyEnv):
 
     def wrap(self, state: Tensor) -> Tensor:
         """State with its heading in [-pi, pi), same shape."""
-        heading = torch.remainder(state[..., 2:3] + math.pi, 2 * math.pi) - math.pi
+        heading = wrapped(state[..., 2:3])
         return torch.cat([state[..., :2], heading, state[..., 3:]], -1)
 
     def previous_state(self, state: Tensor) -> Tensor:

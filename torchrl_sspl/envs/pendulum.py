@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor
 
-from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor
+from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor, wrapped
 from torchrl_sspl.envs.rendering import GymnasiumRenderer, PendulumRenderer
 from torchrl_sspl.envs.system import Opening, Requirement, System
 from torchrl_sspl.errors import ConfigError
@@ -137,7 +137,7 @@ class PixelPendulumEnv(SafetyEnv):
 
     def wrap(self, state: Tensor) -> Tensor:
         """State with its angle in [-pi, pi), ``(*batch, 2) -> (*batch, 2)``."""
-        angle = torch.remainder(state[..., :1] + math.pi, 2 * math.pi) - math.pi
+        angle = wrapped(state[..., :1])
         return torch.cat([angle, state[..., 1:]], dim=-1)
 
     def previous_state(self, state: Tensor) -> Tensor:

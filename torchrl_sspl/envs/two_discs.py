@@ -9,7 +9,7 @@ from functools import cached_property, partial
 import torch
 from torch import Tensor
 
-from torchrl_sspl.envs.base import SafetyEnv, check_tensor
+from torchrl_sspl.envs.base import SafetyEnv, check_tensor, wrapped
 from torchrl_sspl.envs.cmu_dubins import Stays
 from torchrl_sspl.envs.dubins import Disc, ThereAndBack
 from torchrl_sspl.envs.system import Opening, Requirement, System
@@ -130,7 +130,7 @@ class CMUTwoDiscsEnv(SafetyEnv):
 
     def wrap(self, state: Tensor) -> Tensor:
         """State with its heading in [-pi, pi), same shape."""
-        heading = torch.remainder(state[..., 2:3] + math.pi, 2 * math.pi) - math.pi
+        heading = wrapped(state[..., 2:3])
         return torch.cat([state[..., :2], heading, state[..., 3:]], -1)
 
     def previous_state(self, state: Tensor) -> Tensor:
