@@ -27,6 +27,7 @@ PURPOSES = {
     "monitor": 14,  # clean episodes by which the monitor is calibrated
     "pictures": 15,  # changes of what cameras see
     "labels": 16,  # which of few labels are wrong
+    "retries": 17,  # weights of further attempts of a synthesis
 }
 _INDICES = 1 << 24
 _MASK = 0xFFFF_FFFF

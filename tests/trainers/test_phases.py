@@ -28,6 +28,7 @@ from torchrl_sspl.trainers import (
     InnerLoop,
     Phase,
     Phases,
+    Retry,
     Settle,
     Workspace,
     synthesis,
@@ -367,6 +368,61 @@ def test_growth_is_never_paid_for_with_invariance():
         check.run(work)
         kept.append(work.best["round"])
     assert kept == [0, 0, 0, 3]
+
+
+def test_retries_follow_the_rounds_and_learn_from_the_same_data():
+    config = SynthesisConfig(rounds=2, retries=2, fit_steps=100)
+    phases = synthesis_phases(config, check=CheckRound)
+    assert [p.name for p in phases if p.number >= 2] == ["retry", "teach", "fit", "steer", "tune", "check"] * 2
+    work = Workspace(nn.Identity(), *_networks(), config=config)
+    assert [p.size(work) for p in phases if p.name == "fit"] == [100, 50, 100, 100]  # fresh weights have it all to learn
+    assert not [p for p in synthesis_phases(config) if p.name == "retry"]  # nothing would say that they are needed
+
+
+def test_a_retry_draws_fresh_weights_only_where_nothing_has_passed():
+    seen = []
+    for seed, best, number in ((0, None, 1), (0, None, 1), (0, None, 2), (1, None, 1), (0, {"rank": [1.0]}, 1)):
+        work = Workspace(nn.Identity(), *_networks(), seed=seed)
+        work.best, dynamics, before = best, work.dynamics.state_dict(), work.barrier(torch.ones(1, 2)).item()
+        torch.manual_seed(len(seen))  # does not matter
+        Retry(number).run(work)
+        assert work.skip == (best is not None)
+        assert all(torch.equal(v, dynamics[k]) for k, v in work.dynamics.state_dict().items())
+        value, action = (net(torch.ones(1, 2)).item() for net in (work.barrier, work.policy))
+        seen.append((value, action))
+        assert (value != before) == (best is None)
+    assert seen[0] == seen[1]
+    assert len(set(seen)) == 4
+
+
+def test_retries_resume_exactly_and_end_when_one_passes(tmp_path, monkeypatch):
+    answers = {0: False, 1: False, 2: True}
+
+    def found(self, work, held_out, level):
+        return Check(self.number, level, 0, 0, 0, 0, 1.0, 0.5, answers[self.number], "" if answers[self.number] else "no")
+
+    monkeypatch.setattr(CheckRound, "_held_out", lambda self, work, agent: object())
+    monkeypatch.setattr(CheckRound, "_check", found)
+    words = ["synthesis.rounds=1", "synthesis.retries=3", "synthesis.cover_share=0", EVERY_STEP]
+    whole = experiment(tmp_path / "whole", *words)
+    agent = whole.train()
+    assert [c.round for c in whole.work.checks] == [0, 1, 2]  # the third retry is not needed
+    assert whole.work.best["round"] == 2
+    rows = [json.loads(line) for line in (whole.directory / "log.jsonl").read_text().splitlines()]
+    assert sum(row["phase"] == "dynamics" and row["round"] > 0 for row in rows) == 0
+    tuned = next(k for k, p in enumerate(whole.phases.phases) if p.number == 2 and p.name == "tune")
+    broken = experiment(tmp_path / "broken", *words)
+    save = broken.trainer._save_trainer
+
+    def die_while_tuning() -> None:
+        save()
+        if broken.phases.done == tuned and broken.work.loop.step == 2:
+            raise Killed
+
+    broken.trainer._save_trainer = die_while_tuning  # type: ignore[method-assign]
+    with pytest.raises(Killed):
+        broken.train()
+    assert_same(experiment(tmp_path / "broken", *words).train(), agent)
 
 
 def test_the_level_moves_the_last_bias(uninterrupted):

@@ -28,7 +28,7 @@ _LEAST = {
     0: "seed evaluation.seed evaluation.walk_seed evaluation.episodes evaluation.walks evaluation.renderer_episodes evaluation.grid "
     "evaluation.kernel_grid evaluation.certificate_episodes evaluation.certificate_seconds synthesis.steady_steps synthesis.dynamics_steps "
     "synthesis.teach_steps synthesis.fit_steps synthesis.steer_steps synthesis.tune_steps synthesis.tighten_steps synthesis.dynamics_outlier "
-    "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices",
+    "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices synthesis.retries",
     1: "evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.batch synthesis.residuals synthesis.actions "
     "synthesis.rim_draws synthesis.check_episodes synthesis.check_horizon",
     4: "synthesis.turns",
@@ -183,6 +183,8 @@ class SynthesisConfig:
     enabled: bool = _option(True, "whether they follow the joint training; never with loss.preset=paper, which trains "
         "as printed.")
     rounds: int = _option(1, "rounds of data, refit, synthesis and fine-tuning.")
+    retries: int = _option(0, "further attempts at barrier and policy with fresh weights, on the same data and dynamics, where no round has passed its "
+        "checks and the environment knows its sets; each is checked on held-out pictures and episodes of its own.")
     gain: float = _option(1.0, "gain k of the latent observer: the latent is the prediction, moved by this share towards "
         "what is seen; 1: only what is seen.")
     episode_steps: int | None = _option(None, "longest episode of the transitions collected for these phases; null is "

@@ -16,6 +16,7 @@ if TYPE_CHECKING:  # what readers of the source, type checkers among them, need 
         FitDynamics,
         FitSets,
         Gather,
+        Retry,
         Settle,
         SteerPolicy,
         TeachPolicy,
@@ -30,7 +31,7 @@ _NAMES = {
     **dict.fromkeys(("CheckRound", "PlaceLevel"), "selection"),
     **dict.fromkeys(("Source", "starts_of"), "source"),
     **dict.fromkeys(
-        ("FineTune", "FitDynamics", "FitSets", "Gather", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "synthesis_phases"),
+        ("FineTune", "FitDynamics", "FitSets", "Gather", "Retry", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "synthesis_phases"),
         "synthesis",
     ),
     "SSPLTrainer": "trainer",
@@ -38,7 +39,7 @@ _NAMES = {
 }
 __all__ = [
     "Check", "CheckRound", "FineTune", "FitDynamics", "FitSets", "Gather", "InnerLoop", "KeepChanges", "Phase", "Phases", "PlaceLevel",
-    "SSPLTrainer", "Settle", "Source", "SteadyEncoder", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "choose_and_spread", "starts_of",
+    "Retry", "SSPLTrainer", "Settle", "Source", "SteadyEncoder", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "choose_and_spread", "starts_of",
     "synthesis_phases",
 ]  # fmt: skip
 

@@ -225,7 +225,7 @@ class Workspace:
         self.checks: list[Check] = []
         self.level = 0.0  # {B <= level} is the set
         self.warnings: list[str] = []
-        self.skip = False  # nothing more can be done on these latents
+        self.skip = False  # nothing more can be done on these latents, or has to be
         self.cache: dict[str, Any] = {}  # what a phase can compute again
         self.begin()
 

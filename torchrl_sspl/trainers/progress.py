@@ -22,7 +22,7 @@ PROGRESS_FILE = "progress.json"
 WORDS = {
     "steady": "steadying the encoder", "changes": "encoding changed pictures", "gather": "encoding what was seen", "dynamics": "fitting the latent dynamics", "teach": "teaching the policy",
     "fit": "fitting safe set and policy", "steer": "steering the policy", "tune": "tuning both on the condition",
-    "tighten": "training on counterexamples", "check": "checking on fresh episodes", "level": "placing the zero level",
+    "tighten": "training on counterexamples", "check": "checking on fresh episodes", "retry": "beginning again with fresh weights", "level": "placing the zero level",
 }  # fmt: skip
 _EVERY = 1.0  # seconds between looks at the loss
 

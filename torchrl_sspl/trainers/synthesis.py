@@ -34,6 +34,7 @@ from torchrl_sspl.objectives import (
 )
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
+from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE
 from torchrl_sspl.trainers.asking import choose_and_spread
 from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
@@ -150,14 +151,40 @@ def _rim_of_unsafe(work: Workspace, index: int) -> dict[str, Tensor]:
     return {k: v[lowest] for k, v in drawn.items()}
 
 
+class Retry(Phase):
+    """Barrier and policy of fresh weights, where no round has passed its checks; else nothing more is done.
+
+    A fit may stay on a plateau, and a fine-tuning may end a little beside what the checks ask for; both hang on the first weights.
+    Data and dynamics stay as they are. Source: none.
+    """
+
+    name = "retry"
+
+    def run(self, work: Workspace) -> None:
+        work.skip = work.skip or work.best is not None
+        if work.skip:
+            return
+        with torch.random.fork_rng():
+            torch.manual_seed(spawn(work.seed, "retries", self.number))
+            for net in (work.barrier, work.policy):
+                for module in net.modules():
+                    if hasattr(module, "reset_parameters"):
+                        module.reset_parameters()
+        work.cache.clear()
+
+
 class _Training(Phase):
     """Takes ``<name>_steps`` of the configuration; where it refits, half of them in further rounds."""
 
     refits = True
 
+    def again(self, work: Workspace) -> bool:
+        """Whether the networks have learnt what they are to learn in an earlier round."""
+        return 0 < self.number < work.config.rounds
+
     def size(self, work: Workspace) -> int:
         steps = getattr(work.config, f"{self.name}_steps")
-        return steps // 2 if self.refits and self.number else steps
+        return steps // 2 if self.refits and self.again(work) else steps
 
 
 class FitDynamics(_Training):
@@ -260,7 +287,7 @@ class FitSets(_Training):
             work.barrier, work.policy, action_scale=work.action_scale, scale=0.1, worst_coeff=1.0 if g else 0.3,
             worst_fraction=0.02 if g else 0.05, safety_margin=s.unsafe_margin, unsafe_coeff=float(g),
         )  # fmt: skip
-        rates = {work.barrier: 5e-3 if self.number == 0 else 2e-3, work.policy: 3e-3}
+        rates = {work.barrier: 2e-3 if self.again(work) else 5e-3, work.policy: 3e-3}
         shares = [(torch.arange(len(table)), s.batch)]
         if g:
             near = table["barrier_target"][:, 0].abs() < _NEAR_ZERO
@@ -527,7 +554,7 @@ def _as_changed(work: Workspace, latent: Tensor) -> Tensor:
 
 
 def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] | None = None) -> list[Phase]:
-    """The phases of every round.
+    """The phases of every round, and of those on the same data that follow where none has passed its checks.
 
     Args:
         config: gives the number of rounds and the teacher.
@@ -543,8 +570,10 @@ def synthesis_phases(config: SynthesisConfig, *, check: Callable[[int], Phase] |
     tighten = [Settle if config.grid else Tighten] if config.tighten_steps and (config.grid or config.tolerated_error > 0) else []
     steady = [SteadyEncoder(0), KeepChanges(0)] if config.steady_steps else []
     after = tighten if config.grid else [SteerPolicy, FineTune, *tighten]
-    kinds: list[Any] = [Gather, FitDynamics, *teach, FitSets, *after, *([check] if check else [])]
-    return [*steady, *(kind(k) for k in range(config.rounds) for kind in kinds)]
+    sets: list[Any] = [*teach, FitSets, *after, *([check] if check else [])]
+    rounds = [kind(k) for k in range(config.rounds) for kind in (Gather, FitDynamics, *sets)]
+    retries = [kind(config.rounds + k) for k in range(config.retries if check else 0) for kind in (Retry, *sets)]
+    return [*steady, *rounds, *retries]
 
 
 def _pieces(continues: Tensor) -> Tensor:
@@ -557,4 +586,4 @@ def _pieces(continues: Tensor) -> Tensor:
     return torch.where(piece < ends[:, None], piece, -1)
 
 
-__all__ = ["FineTune", "FitDynamics", "FitSets", "Gather", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "synthesis_phases"]
+__all__ = ["FineTune", "FitDynamics", "FitSets", "Gather", "Retry", "Settle", "SteerPolicy", "TeachPolicy", "Tighten", "synthesis_phases"]
