@@ -1,12 +1,15 @@
 """Few labels: how large and how wrong the set is over the number of labelled pictures, of unlabelled transitions, of wrong labels.
 
 Run: python benchmarks/few_labels.py [env=pendulum] [labels=100,300,1000,all] [transitions=20000] [wrong=0,0.01,0.05] [seed=0,1,2] [out=runs/few_labels]
-     [run=false] [score.KEY=VALUE ...] [KEY=VALUE of the training ...]
+     [starts=[0.6,0.15,0.25]] [run=false] [score.KEY=VALUE ...] [KEY=VALUE of the training ...]
+     python benchmarks/few_labels.py figure [out=runs/few_labels]
 
 Every point is a training of its own, with the recommended settings, one round and no rollouts; a point that has been measured is read.
 Of ``transitions``, recorded under random actions with 15 % of the episodes starting in S and 25 % in U, at most ``labels`` of each
-kind are labelled, those that come first; the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. The level of the set is placed by held-out episodes with labels of their
-own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``.
+kind are labelled, those that come first; the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
+``collector.max_frames_per_traj=1`` records nothing without a label. The level of the set is placed by held-out episodes with labels of their
+own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``; ``figure`` draws all points that there are,
+over the number of labels and over that of the transitions, in ``few_labels.png``.
 """
 
 from __future__ import annotations
@@ -14,20 +17,24 @@ from __future__ import annotations
 import itertools
 import json
 import sys
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from torchrl_sspl.baselines import Budget, ScoreConfig, make, score
 from torchrl_sspl.baselines.cell import Cell
 from torchrl_sspl.configs.reader import parse
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.files import RunDirectory, write
+from torchrl_sspl.viz.plane import PATH_COLOURS, new_figure
 
 LISTS = {"labels": "100,300,1000,all", "transitions": "20000", "wrong": "0", "seed": "0,1,2"}
-SHARES = (0.6, 0.15, 0.25)  # of the episodes: anywhere or outside U, in S, in U
+STARTS = "[0.6,0.15,0.25]"  # shares of the episodes: anywhere or outside U, in S, in U
 COLUMNS = (
     ("volume / kernel", "claimed_over_kernel"), ("false-safe", "false_safe"), ("U called safe", "unsafe_called_safe"),
     ("claimed, enter U", "claimed_harmless_enter"), ("common, enter U", "common_harmless_enter"),
@@ -44,13 +51,15 @@ class Point:
     wrong: float
     seed: int
     options: tuple[str, ...]
+    starts: tuple[float, ...] = tuple(json.loads(STARTS))
 
     @property
     def path(self) -> Path:
         """File of the point, below the directory of all."""
         name = f"{self.labels}-labels-{self.transitions}-transitions-{self.wrong}-wrong"
-        if self.options:
-            name += f"-{sha256(' '.join(self.options).encode()).hexdigest()[:8]}"
+        other = [*self.options, *([] if self.starts == Point.starts else [str(self.starts)])]
+        if other:
+            name += f"-{sha256(' '.join(other).encode()).hexdigest()[:8]}"
         return Path(self.env) / name / str(self.seed) / "point.json"
 
     def measure(self, path: Path, sizes: ScoreConfig) -> dict[str, Any]:
@@ -61,7 +70,7 @@ class Point:
             few = [] if self.labels == "all" else [f"labels.safe={self.labels}", f"labels.unsafe={self.labels}"]
             method = make("sspl", [f"overrides={json.dumps([f'labels.wrong={self.wrong}', *few, *self.options])}"])
             method.directory, env = directory, Cell("kernel", self.env, seed=self.seed).environment()
-            method.fit(None, env, Budget("few", *(round(share * self.transitions) for share in SHARES)), self.seed)
+            method.fit(None, env, Budget("few", *(round(share * self.transitions) for share in self.starts)), self.seed)
             found = score(method, env, sizes)
             row = asdict(self) | {"passed": method.notes["passed"], "needs": asdict(method.needs), "measurements": found.to_dict()}
             write(path, json.dumps(row, indent=1) + "\n")
@@ -74,7 +83,7 @@ def table(rows: list[dict[str, Any]]) -> str:
     lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
 
     def of(row: dict[str, Any]) -> tuple[Any, ...]:
-        return row["env"], row["labels"], row["transitions"], row["wrong"], tuple(row["options"])
+        return row["env"], row["labels"], row["transitions"], row["wrong"], tuple(row["options"]), tuple(row["starts"])
 
     for _, several in itertools.groupby(rows, key=of):
         found = list(several)
@@ -90,16 +99,63 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def figure(out: Path) -> Path:
+    """Draws volume and false-safe share of all points below ``out`` with right labels, two panels for each system; returns the picture."""
+    rows = [json.loads(path.read_text()) for path in sorted(out.rglob("point.json"))]
+    rows = [row for row in rows if not row["wrong"] and tuple(row["starts"]) == Point.starts]
+    if not rows:
+        raise ConfigError(f"figure: expected measured points below '{out}', found none; run the benchmark first")
+    for row in rows:
+        row["labels known"] = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
+        chosen = [o.partition("=")[2] for o in row["options"] if o.startswith("labels.choose=")]
+        row["chosen"] = f", {chosen[0]} of them chosen" if chosen else ""
+    systems = sorted({row["env"] for row in rows})
+    drawn = new_figure(9, 2.9 * len(systems))
+    for env, (left, right) in zip(systems, drawn.subplots(len(systems), 2, squeeze=False), strict=True):
+        of_env = [row for row in rows if row["env"] == env]
+        _panel(left, of_env, "labels known", "labels", lambda row: f"{row['transitions']:,} transitions{row['chosen']}")
+        varied = {row["transitions"] for row in of_env}
+        several = [row for row in of_env if {r["transitions"] for r in of_env if r["labels"] == row["labels"]} == varied]
+        _panel(right, several, "transitions", "transitions", lambda row: f"{row['labels']} labels of S and of U{row['chosen']}")
+        left.set(xlabel="labelled pictures", ylabel="%", title=env)
+        right.set(xlabel="transitions", title=env)
+    drawn.suptitle("Solid, discs: volume over that of the kernel. Dotted, squares: false-safe share. Filled: held-out checks pass.", fontsize=8)
+    path = out / "few_labels.png"
+    drawn.savefig(path, dpi=150)
+    return path
+
+
+def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callable[[dict[str, Any]], str]) -> None:
+    """One mark for each training over ``x``, and lines through the means of those that share a name and a place."""
+    names = sorted({name(row) for row in rows})
+    for colour, label in zip(PATH_COLOURS, names, strict=False):
+        for measure, mark, style in (("claimed_over_kernel", "o", "-"), ("false_safe", "s", ":")):
+            groups: dict[Any, list[tuple[float, float]]] = {}
+            for row in (row for row in rows if name(row) == label and row["measurements"][measure]["value"] is not None):
+                at = row[x], 100 * row["measurements"][measure]["value"]
+                groups.setdefault(row[place], []).append(at)
+                ax.plot(*at, mark, color=colour, markerfacecolor=colour if row["passed"] else "white", markersize=5)
+            means = np.array(sorted(tuple(np.mean(of, 0)) for of in groups.values())).reshape(-1, 2)
+            ax.plot(*means.T, style, color=colour, label=label if style == "-" else None)
+    ax.set(xscale="log", ylim=(-3, 103))
+    if names:
+        ax.legend(fontsize=7, loc="center right")
+
+
 def main(words: list[str]) -> None:
     """Train what is missing, print the table, write the JSON."""
     torch.set_num_threads(1)
+    if words[:1] == ["figure"]:
+        print(figure(Path(parse(words[1:]).get("out", "runs/few_labels"))))
+        return
     given = parse(words)
     lists = [given.pop(name, usual).split(",") for name, usual in LISTS.items()]
     env, out, run = given.pop("env", "pendulum"), Path(given.pop("out", "runs/few_labels")), given.pop("run", "true") == "true"
     sizes = Cell.of("kernel", [f"{k}={given.pop(k)}" for k in [*given] if k.startswith("score.")]).score
+    starts = tuple(float(v) for v in json.loads(given.pop("starts", STARTS)))
     more, rows = tuple(f"{k}={v}" for k, v in given.items()), []
     for labels, transitions, wrong, seed in itertools.product(*lists):
-        one = Point(env, labels, int(transitions), float(wrong), int(seed), more)
+        one = Point(env, labels, int(transitions), float(wrong), int(seed), more, starts)
         if run or (out / one.path).is_file():
             rows.append(one.measure(out / one.path, sizes))
             print(table(rows[-1:]), file=sys.stderr, flush=True)

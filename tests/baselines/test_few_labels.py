@@ -7,6 +7,10 @@ import runpy
 import sys
 from pathlib import Path
 
+import pytest
+
+from torchrl_sspl.errors import ConfigError
+
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "few_labels.py"
 SIZES = ["score.episodes=4", "score.horizon=3", "score.grid=11", "score.kernel_grid=31", "score.frames=1", "score.shifted=0"]
 SHORT = [
@@ -16,12 +20,16 @@ SHORT = [
 ]  # fmt: skip
 
 
+def start(monkeypatch, *words: str) -> None:
+    monkeypatch.setattr(sys, "argv", ["few_labels.py", *words])
+    runpy.run_path(str(BENCHMARK), run_name="__main__")
+
+
 def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, monkeypatch, capsys):
     words = ["labels=20,all", "transitions=1280", "wrong=0.05", "seed=0", f"out={tmp_path}", *SIZES, *SHORT]
 
     def run(*more: str) -> str:
-        monkeypatch.setattr(sys, "argv", ["few_labels.py", *words, *more])
-        runpy.run_path(str(BENCHMARK), run_name="__main__")
+        start(monkeypatch, *words, *more)
         return capsys.readouterr().out
 
     assert "| 20 | 20 |" not in run("run=false")
@@ -34,3 +42,43 @@ def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, 
     assert run() == printed
     assert run("run=false") == printed
     assert [path.stat().st_mtime_ns for path in sorted(tmp_path.rglob("point.json"))] == before
+
+
+def point(out: Path, labels: str, transitions: int, volume: float | None, *, passed: bool, wrong: float = 0.0) -> None:
+    path = out / f"{labels}-{transitions}-{wrong}" / "point.json"
+    path.parent.mkdir(parents=True)
+    counts = {"safe_labels": 100, "unsafe_labels": 100, "neither_labels": 0}
+    measured = {"claimed_over_kernel": {"value": volume}, "false_safe": {"value": None}}
+    path.write_text(json.dumps({
+        "env": "pendulum", "labels": labels, "transitions": transitions, "wrong": wrong, "seed": 0, "options": [], "starts": [0.6, 0.15, 0.25],
+        "passed": passed, "needs": counts, "measurements": measured,
+    }))  # fmt: skip
+
+
+def test_the_figure_shows_every_training_and_which_of_them_pass(tmp_path, monkeypatch, capsys):
+    point(tmp_path, "100", 20_000, 0.5, passed=True)
+    point(tmp_path, "all", 20_000, 0.7, passed=False)
+    point(tmp_path, "100", 2_000, None, passed=False)
+    point(tmp_path, "100", 20_000, 0.9, passed=True, wrong=0.01)
+    figure = runpy.run_path(str(BENCHMARK))["figure"]
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, path, **look: drawn.append(self))
+    drawn: list = []
+    figure(tmp_path)
+    left, right = drawn[0].axes
+    marks = [line for line in left.lines if line.get_marker() == "o"]
+    assert sorted(line.get_ydata()[0] for line in marks) == [50.0, 70.0]  # a wrong label makes another figure
+    assert {line.get_ydata()[0] for line in marks if line.get_markerfacecolor() == "white"} == {70.0}
+    assert [text.get_text() for text in right.get_legend().get_texts()] == ["100 labels of S and of U"]
+
+
+def test_a_figure_of_nothing_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="expected measured points"):
+        runpy.run_path(str(BENCHMARK))["figure"](tmp_path)
+
+
+def test_without_unlabelled_pictures_every_one_has_a_label(tmp_path, monkeypatch, capsys):
+    words = ["labels=all", "transitions=640", "seed=0", "starts=[0,0.5,0.5]", "collector.max_frames_per_traj=1", f"out={tmp_path}", *SIZES, *SHORT]
+    start(monkeypatch, *words)
+    (row,) = json.loads((tmp_path / "points.json").read_text())
+    needs = row["needs"]
+    assert needs["safe_labels"] + needs["unsafe_labels"] == needs["transitions"]
