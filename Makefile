@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: pendulum quadruped demo test docs wheel release-check clean
+.PHONY: pendulum quadruped demo table test docs wheel release-check clean
 
 pendulum: $(VENV)/.viz
 	$(BIN)/python examples/inverted_pendulum.py $(ARGS)
@@ -15,6 +15,10 @@ quadruped: $(VENV)/.quadruped
 # The shipped agent in full physics: a film and a report in runs/demo.
 demo: $(VENV)/.quadruped
 	OMP_NUM_THREADS=1 $(BIN)/python examples/quadruped_obstacle.py agent=quadruped evaluation.episodes=0 evaluation.walks=20 out_dir=runs/demo $(ARGS)
+
+# The paper's Table I in numbers; cells that have been measured are read. ARGS="methods=latent_cbf budget=full seed=0,1,2 jobs=2".
+table: $(VENV)/.viz $(VENV)/.quadruped
+	OMP_NUM_THREADS=1 $(BIN)/python -m torchrl_sspl.baselines table $(ARGS)
 
 test: $(VENV)/.test
 	$(BIN)/ruff check .
