@@ -106,13 +106,13 @@ def test_a_car_is_shown_at_its_middle_heading(tmp_path):
 
 
 def test_several_seeds_are_a_mean_and_the_worst():
-    def row(value):
+    def row(value, proved="nothing"):
         names = ["claimed_over_kernel", "false_safe", "latency_p50", "latency_p99"]
         return {
             "cell": {"method": "latent_cbf"}, "minutes": {"fit_cpu": 2.0},
             "needs": dict.fromkeys(
-                ["transitions", "safe_labels", "unsafe_labels", "states", "masks", "expert_actions", "state_at_run_time", "dynamics", "proved"], 0
-            ) | {"proved": "nothing"},
+                ["transitions", "safe_labels", "unsafe_labels", "states", "masks", "expert_actions", "state_at_run_time", "dynamics"], 0
+            ) | {"proved": proved, "measured": "nothing", "claimed": "invariance"},
             "measurements": {n: {"value": value} for n in names},
         }  # fmt: skip
 
@@ -121,6 +121,8 @@ def test_several_seeds_are_a_mean_and_the_worst():
     assert "60.0 % (50.0 %) | 60.0 % (70.0 %)" in text
     assert "✗ ✗ ✗ ✗ ✓ ✗" in text
     assert "seeds" not in text
+    assert "| 2.0 | nothing | nothing | invariance | ✗" in text
+    assert "| nothing or [V] | nothing |" in markdown(list(zip(asked, [row(0.5), row(0.7, "[V]")], strict=True)))  # not of every seed
     text = markdown(list(zip(asked, [row(0.5), "SolverError: no"], strict=True)))
     assert "| latent_cbf (1 of 2 seeds; SolverError: no) | small | 50.0 %" in text  # what is missing is no mean
     empty = row(0.5)
