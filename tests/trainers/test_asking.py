@@ -72,6 +72,39 @@ def test_only_labels_say_s_and_no_answer_is_read_that_was_not_asked_for():
     assert choose_and_spread(z[rows], start, answer[rows], 100)[1].all()  # those that look the same, too
 
 
+def test_labels_that_all_others_contradict_are_not_used():
+    z, answer = box()
+    start = first(answer, 20)
+    right, told = choose_and_spread(z, start, answer, 160)
+    far = (z.abs().amax(1) - 0.6).abs() > 0.1
+    wrong = (told & far).nonzero()[::6, 0]
+    assert len(wrong) >= 5
+    mistaken = answer.clone()
+    mistaken[wrong] = torch.where(answer[wrong] == UNSAFE, SAFE, UNSAFE)
+    region, still = choose_and_spread(z, told, mistaken, 0)
+    assert torch.equal(still, told)  # they were asked for, and cost what they cost
+    assert torch.equal(region[wrong] == UNSAFE, answer[wrong] == UNSAFE)
+
+    def missed(found: torch.Tensor) -> int:
+        return int(((found != UNSAFE) & (answer == UNSAFE)).sum())
+
+    assert missed(region) <= missed(right) + 10
+
+
+def test_what_the_others_say_of_a_label_is_the_interpolation_without_it():
+    from scipy.interpolate import RBFInterpolator
+
+    from torchrl_sspl.trainers.asking import _SMOOTHING, _left_out
+
+    z, answer = box(40)
+    y = torch.where(answer == UNSAFE, 1.0, -1.0).double()
+    found = _left_out(z.double(), y)
+    for j in (0, 7, 39):
+        others = torch.arange(40) != j
+        f = RBFInterpolator(z[others].double().numpy(), y[others].numpy(), kernel="linear", smoothing=_SMOOTHING)
+        assert float(found[j]) == pytest.approx(f(z[j : j + 1].double().numpy())[0], abs=1e-6)
+
+
 @pytest.mark.parametrize("codes", [[UNSAFE, UNSAFE], [SAFE, SAFE]])
 def test_labels_of_one_side_alone_are_refused(codes):
     told = torch.ones(2, dtype=torch.bool)

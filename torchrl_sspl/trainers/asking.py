@@ -13,6 +13,8 @@ _ROUNDS = 20  # in which labels are asked for; what they say of the others is co
 _DOUBT = 0.3  # value of f up to which the border of U may be near
 _CAUTION = 0.1  # below zero from which on a latent counts as of U
 _SMOOTHING = 0.1  # of f, latent units: the border does not turn to every single label
+_AGAINST = 0.9  # value of what the other labels say beyond which one is wrong that says the opposite
+_ENOUGH = 20  # labels of either kind from which on this is asked
 _MOST, _AROUND = 2000, 64  # labels that are interpolated all at once, and of more the nearest ones
 
 
@@ -25,7 +27,8 @@ def choose_and_spread(seen: Tensor, told: Tensor, answer: Tensor, count: int) ->
 
     where f interpolates 1 at the latents :math:`z_j` that are told to be of U, and -1 at those that are told not to be: asked for is what may
     lie on the border of U and far from what is known. Unlike labels of S and U alone, an answer can be *neither*: without it nobody
-    knows where U ends. Source: none (uncertainty sampling, spread out by distances); the paper takes its labels at random.
+    knows where U ends. A label that all others contradict, :math:`f_{-j}(z_j)` beyond 0.9 on the other side where f is interpolated without it, counts as
+    wrong and is not used. Source: none (uncertainty sampling, spread out by distances); the paper takes its labels at random.
 
     Args:
         seen: ``(n, p)`` latents of single pictures.
@@ -33,7 +36,7 @@ def choose_and_spread(seen: Tensor, told: Tensor, answer: Tensor, count: int) ->
         answer: ``(n,)`` codes of ``sets``; read only where a label is known or asked for.
         count: labels that are asked for.
 
-    Returns ``(n,)`` codes, in which only labels say S, and of which labels are known now, bool. Raises EmptyRegionError where nothing
+    Returns ``(n,)`` codes, in which only labels say S, and of which labels are known now, wrong ones among them, bool. Raises EmptyRegionError where nothing
     is told to be of U, or nothing not to be.
 
     Example:
@@ -57,8 +60,9 @@ def choose_and_spread(seen: Tensor, told: Tensor, answer: Tensor, count: int) ->
             row = (doubt * far).masked_fill(told, -1.0).argmax()
             told[row] = True
             far = torch.minimum(far, (seen - seen[row]).norm(dim=1))
-    spread = torch.where(_interpolated(seen, told, unsafe) > -_CAUTION, UNSAFE, UNLABELLED)
-    return torch.where(told, answer, spread), told
+    used = told & ~_contradicted(seen, told, unsafe)
+    spread = torch.where(_interpolated(seen, used, unsafe) > -_CAUTION, UNSAFE, UNLABELLED)
+    return torch.where(used, answer, spread), told
 
 
 def _interpolated(seen: Tensor, told: Tensor, unsafe: Tensor) -> Tensor:
@@ -69,6 +73,28 @@ def _interpolated(seen: Tensor, told: Tensor, unsafe: Tensor) -> Tensor:
     z, near = seen.double().numpy(), None if int(told.sum()) <= _MOST else _AROUND
     f = RBFInterpolator(z[told.numpy()], torch.where(unsafe[told], 1.0, -1.0).numpy(), neighbors=near, kernel="linear", smoothing=_SMOOTHING)
     return torch.as_tensor(f(z), dtype=torch.float32)
+
+
+def _contradicted(seen: Tensor, told: Tensor, unsafe: Tensor) -> Tensor:
+    """``(n,)`` which labels all others contradict; of few labels nothing is said, nor of more than are interpolated all at once."""
+    found, sides = torch.zeros_like(told), (int((told & unsafe).sum()), int((told & ~unsafe).sum()))
+    if min(sides) >= _ENOUGH and sum(sides) <= _MOST:
+        y = torch.where(unsafe[told], 1.0, -1.0).double()
+        found[told] = _left_out(seen[told].double(), y) * y < -_AGAINST
+    return found
+
+
+def _left_out(z: Tensor, y: Tensor) -> Tensor:
+    r"""f at every latent ``(n, p)`` without its own value ``(n,)``: :math:`f_{-j}(z_j) = y_j - c_j / (A^{-1})_{jj}` where :math:`A c = y`.
+
+    A is the matrix of the interpolation, with its constant.
+    """
+    n = len(z)
+    system = torch.ones(n + 1, n + 1, dtype=torch.float64)
+    system[:n, :n] = _SMOOTHING * torch.eye(n) - torch.cdist(z, z, compute_mode="donot_use_mm_for_euclid_dist")
+    system[n, n] = 0.0
+    inverse = torch.linalg.inv(system)[:n, :n]
+    return y - inverse @ y / inverse.diagonal()
 
 
 __all__ = ["choose_and_spread"]
