@@ -70,6 +70,23 @@ def test_the_first_of_the_best_is_chosen():
     assert search(lambda words: -1.0 if not words else 2.0, options)[0] == ("a=1",)
 
 
+def test_trials_that_have_been_made_are_not_made_again():
+    made, kept = [], []
+
+    def trial(words):
+        made.append(words)
+        return float(len(made))
+
+    options = [(), ("a=1",), ("a=2",)]
+    with pytest.raises(KeyboardInterrupt):
+        search(trial, options, keep=lambda found: kept.append([*found]) if len(kept) < 2 else (_ for _ in ()).throw(KeyboardInterrupt))
+    assert made == options
+    chosen, found = search(trial, options, kept[-1])
+    assert made == [*options, ("a=2",)]
+    assert chosen == ("a=2",)
+    assert [t["merit"] for t in found] == [1.0, 2.0, 4.0]
+
+
 def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(kind_of("nerf_cbf"), "space", {"steps": (3, 5)})
@@ -80,15 +97,15 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
     assert first["tuning"]["chosen"] in [t["options"] for t in first["tuning"]["trials"]]
     path = tmp_path / "runs/baselines/pendulum/tiny/nerf_cbf-steps-2-trials-3" / TRIALS_FILE
     told = json.loads(path.read_text())
-    told["chosen"] = ["steps=5"]
+    told["trials"][-1]["merit"] = 1e6
     path.write_text(json.dumps(told))
-    assert run_cell(Cell.of("nerf_cbf", ["seed=1", *words]))["tuning"]["chosen"] == ["steps=5"]
+    assert run_cell(Cell.of("nerf_cbf", ["seed=1", *words]))["tuning"]["chosen"] == told["trials"][-1]["options"] != []
     assert "tuning" not in run_cell(Cell.of("nerf_cbf", ["steps=2", *SMALL]))
     assert Cell.of("lqr", ["trials=8"]).trials == 0
     assert SEED not in (0, 1, 2)
     told["of"]["horizon"] = 7
     path.write_text(json.dumps(told))  # trials of something else
-    monkeypatch.setattr("torchrl_sspl.baselines.tuning.search", lambda trial, options: (("steps=3",), []))
+    monkeypatch.setattr("torchrl_sspl.baselines.tuning.search", lambda *of: (("steps=3",), []))
     assert run_cell(Cell.of("nerf_cbf", ["seed=2", *words]))["tuning"]["chosen"] == ["steps=3"]
     with pytest.raises(ConfigError, match=f"another seed than {SEED}"):
         Cell.of("nerf_cbf", [f"seed={SEED}", "trials=3"])

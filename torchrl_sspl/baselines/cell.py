@@ -173,16 +173,15 @@ def _fit(method: SafetyMethod, env: SafetyEnv, cell: Cell, seed: int) -> None:
 
 
 def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
-    """Options that trials have chosen, and the trials; they are the same for all scored seeds, and made once."""
+    """Options that trials have chosen, and the trials; they are the same for all scored seeds, and each is made once."""
     path = (cell.directory if cell.out_dir else cell.directory.parent) / TRIALS_FILE
     horizon = cell.score.horizon or 60
     asked = {
         "method": cell.method, "env": cell.env, "budget": cell.budget, "options": list(cell.options), "trials": cell.trials, "horizon": horizon,
     }  # fmt: skip
-    if path.is_file():
-        told = json.loads(path.read_text())
-        if told.get("of") == asked:
-            return told["chosen"], told["trials"]
+    options, told = tuning.draws(cell.method, cell.trials), []
+    if path.is_file() and (found := json.loads(path.read_text())).get("of") == asked:
+        told = found["trials"]
     env = replace(cell, seed=tuning.SEED).environment()
 
     def trial(words: Sequence[str]) -> float:
@@ -192,9 +191,7 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
             _fit(method, env, cell, tuning.SEED)
             return tuning.merit(method, env, horizon=horizon)
 
-    chosen, trials = tuning.search(trial, tuning.draws(cell.method, cell.trials))
-    write(path, json.dumps({"of": asked, "chosen": list(chosen), "trials": trials}, indent=1) + "\n")
-    return chosen, trials
+    return tuning.search(trial, options, told, lambda so_far: write(path, json.dumps({"of": asked, "trials": so_far}, indent=1) + "\n"))
 
 
 def run_cell(cell: Cell) -> dict[str, Any]:

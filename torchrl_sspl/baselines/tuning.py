@@ -14,6 +14,7 @@ from torchrl_sspl.baselines.scoring import NOMINALS, adversarial, barrier_on, ha
 from torchrl_sspl.envs.base import SafetyEnv
 
 SEED = 100  # of recording, weights and starts of the trials; scored seeds are others
+Trial = dict[str, Any]  # the options, and what they were worth
 LOST = 10.0  # an episode from the claimed set that enters U costs as much as so many that do not are worth
 
 
@@ -70,16 +71,27 @@ def merit(method: SafetyMethod, env: SafetyEnv, *, states: int = 400, horizon: i
     return float(((claimed & ~lost).sum() - price * lost.sum()) / states)
 
 
-def search(trial: Callable[[Sequence[str]], float], options: Sequence[Sequence[str]]) -> tuple[Sequence[str], list[dict[str, Any]]]:
+def search(
+    trial: Callable[[Sequence[str]], float], options: Sequence[Sequence[str]], told: Sequence[Trial] = (), keep: Callable[[list[Trial]], object] = lambda _: None
+) -> tuple[Sequence[str], list[Trial]]:
     """The options of the largest merit, the first of them, and what every trial was worth. Source: none.
+
+    Args:
+        trial: options -> merit.
+        options: of each trial.
+        told: the first of the trials, which an earlier call has made.
+        keep: is given all trials so far after each of them.
 
     Example:
         >>> search(lambda words: float(len(words)), [(), ("a=1",)])
         (('a=1',), [{'options': [], 'merit': 0.0}, {'options': ['a=1'], 'merit': 1.0}])
     """
-    told = [{"options": list(words), "merit": trial(words)} for words in options]
-    best = max(range(len(told)), key=lambda k: (told[k]["merit"], -k))
-    return options[best], told
+    found = [*told]
+    for words in options[len(found) :]:
+        found.append({"options": list(words), "merit": trial(words)})
+        keep(found)
+    best = max(range(len(found)), key=lambda k: (found[k]["merit"], -k))
+    return options[best], found
 
 
 __all__ = ["LOST", "SEED", "draws", "merit", "search"]
