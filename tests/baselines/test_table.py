@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import signal
 from dataclasses import replace
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchrl_sspl.baselines.page import claims, failures, page
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.baselines.table import DEFAULTS, TICKS, cells, markdown, table
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.interrupts import Interrupted
 
 SMALL = ["score.episodes=10", "score.horizon=5", "score.grid=21", "score.kernel_grid=31", "score.frames=2"]
 
@@ -93,6 +95,17 @@ def test_cells_side_by_side_are_those_one_after_the_other(tmp_path, monkeypatch)
         assert "latency" in name or row["measurements"][name]["value"] == measured["value"]
     with pytest.raises(ConfigError, match="jobs >= 1, received run=true and jobs=0"):
         table(["jobs=0", *words])
+
+
+@pytest.mark.parametrize("words", [["lqr"], ["table", "methods=lqr", "env=pendulum"]])
+def test_a_signal_ends_the_command_and_what_is_done_stays(words, monkeypatch, capsys, tmp_path):
+    """Without a handler of its own SDL, which draws shifted pictures, would take the signal and do nothing."""
+    monkeypatch.chdir(tmp_path)
+    for module in ("__main__", "table"):
+        monkeypatch.setattr(f"torchrl_sspl.baselines.{module}.run_cell", lambda cell: signal.raise_signal(signal.SIGTERM))
+    with pytest.raises(Interrupted, match="143"):
+        main(words)
+    assert "interrupted by SIGTERM; rows and trials that are done stay" in capsys.readouterr().err
 
 
 def test_a_car_is_shown_at_its_middle_heading(tmp_path):

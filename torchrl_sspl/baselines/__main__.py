@@ -5,9 +5,10 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from torchrl_sspl.baselines.cell import Cell, run_cell, text
+from torchrl_sspl.baselines.cell import STAYS, Cell, run_cell, text
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.errors import SSPLError
+from torchrl_sspl.interrupts import interruptible
 
 _USAGE = """python -m torchrl_sspl.baselines METHOD [env=pendulum|dubins] [budget=small|full] [seed=0] [trials=8] [out_dir=...] [key=value ...]
 
@@ -28,11 +29,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(_USAGE + "\n".join(lines))
         return 0 if words else 2
     try:
-        if words[0] == "table":
-            from torchrl_sspl.baselines import page
+        with interruptible(lambda: STAYS):
+            if words[0] == "table":
+                from torchrl_sspl.baselines import page
 
-            return page.main(words[1:])
-        print(text(run_cell(Cell.of(words[0], words[1:]))))
+                return page.main(words[1:])
+            print(text(run_cell(Cell.of(words[0], words[1:]))))
     except SSPLError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)
         return 2

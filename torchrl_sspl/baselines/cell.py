@@ -33,6 +33,7 @@ from torchrl_sspl.seeds import spawn
 from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
 ROW_FILE, CLAIMS_FILE, TRIALS_FILE = "row.json", "claims.npz", "trials.json"
+STAYS = "rows and trials that are done stay; the same command goes on from there"
 SCHEMA = 1
 _OWN = ("env", "budget", "seed", "out_dir", "trials")
 

@@ -12,10 +12,11 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from torchrl_sspl.baselines.cell import Cell, run_cell, stored
+from torchrl_sspl.baselines.cell import STAYS, Cell, run_cell, stored
 from torchrl_sspl.baselines.registry import kind_of
 from torchrl_sspl.configs.reader import parse
 from torchrl_sspl.errors import ConfigError, SSPLError
+from torchrl_sspl.interrupts import interruptible
 
 Row = dict[str, Any] | str  # what was measured, or why nothing was
 
@@ -125,7 +126,8 @@ def table(words: Sequence[str]) -> list[tuple[Cell, Row]]:
 def _row(cell: Cell, *, run: bool) -> Row:
     """What was measured, or why nothing was."""
     try:
-        return run_cell(cell) if run else stored(cell, any_score=True) or "not measured"
+        with interruptible(lambda: STAYS):  # here, too: it may be another process
+            return run_cell(cell) if run else stored(cell, any_score=True) or "not measured"
     except SSPLError as error:
         return f"{type(error).__name__}: {error}"
 
