@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "few_labels.py"
@@ -82,3 +83,13 @@ def test_without_unlabelled_pictures_every_one_has_a_label(tmp_path, monkeypatch
     (row,) = json.loads((tmp_path / "points.json").read_text())
     needs = row["needs"]
     assert needs["safe_labels"] + needs["unsafe_labels"] == needs["transitions"]
+
+
+def test_wrong_labels_are_found_and_right_ones_used():
+    measure = runpy.run_path(str(BENCHMARK.with_name("wrong_labels.py")))["measure"]
+    right, wrong = (measure(PendulumEnv(), share, 0, 1500) for share in (0.0, 0.05))
+    assert right["wrong"] == right["right and not used"] == 0
+    assert right["missed"] == right["missed if all labels are used"]
+    assert wrong["wrong and not used"] > 0.3 * wrong["wrong"] > 0
+    assert wrong["right and not used"] <= 2
+    assert wrong["missed"] < wrong["missed if all labels are used"]
