@@ -7,7 +7,7 @@ import json
 import pytest
 import torch
 
-from torchrl_sspl.baselines import BUDGETS, make
+from torchrl_sspl.baselines import BUDGETS, make, record
 from torchrl_sspl.baselines.cell import TRIALS_FILE, Cell, run_cell
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.baselines.tuning import SEED, draws, merit, search
@@ -111,3 +111,68 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
         Cell.of("nerf_cbf", [f"seed={SEED}", "trials=3"])
     with pytest.raises(ConfigError, match="expected trials to be an integer"):
         Cell.of("nerf_cbf", ["trials=few"])
+
+
+STAGES = {
+    "vision_cbf": (["steps=2", "batch=8"], "offset=0.1", "steps=3"),
+    "neural_cbf": (["perception_steps=2", "steps=2"], "steps=4", "perception_steps=3"),
+    "latent_cbf": (["autoencoder_steps=2", "steps=2"], "hinge=9.0", "gain=2.0"),
+    "latent_safe": (["world_steps=2", "margin_steps=2", "steps=3"], "actions=5", "world_steps=3"),
+    "smooth_latent": (["world_steps=2", "margin_steps=2", "steps=3"], "slope=0.5", "world_steps=3"),
+}
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_trials_share_what_a_stage_has_learnt_and_are_the_same(name):
+    env = PendulumEnv([16])
+    data, seen = record(env, BUDGETS["tiny"], 0), env.observe(env.sample_states(5))
+    plain, later, earlier = STAGES[name]
+
+    def fitted(words, stages):
+        method = make(name, [*plain, *words])
+        method.stages = stages
+        torch.manual_seed(0)
+        method.fit(data, env, BUDGETS["tiny"], 0)
+        return method.barrier(seen), method.notes
+
+    shared = {}
+    first = fitted([], shared)
+    learnt = [*shared.values()]
+    (value, notes), alone = fitted([later], shared), fitted([later], {})
+    assert len(shared) == 1
+    assert next(iter(shared.values())) is learnt[0]
+    assert torch.equal(value, alone[0])
+    assert notes == alone[1]
+    assert not torch.equal(value, first[0])
+    fitted([earlier], shared)
+    assert len(shared) == 2
+
+
+@pytest.mark.parametrize("name", STAGES)
+def test_a_stage_reads_no_option_that_it_does_not_name(name):
+    env, read = PendulumEnv([16]), set()
+
+    class Config:
+        def __init__(self, of):
+            self.of = of
+
+        def __getattr__(self, option):
+            read.add(option)
+            return getattr(self.of, option)
+
+    method = make(name, STAGES[name][0])
+    method.config, staged = Config(method.config), method.stage
+
+    def stage(options, learn):
+        def learns():
+            read.clear()
+            found = learn()
+            assert read
+            assert read <= set(options)
+            return found
+
+        return staged(options, learns)
+
+    method.stage = stage
+    method.fit(record(env, BUDGETS["tiny"], 0), env, BUDGETS["tiny"], 0)
+    assert len(method.stages) == 1

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
@@ -10,7 +12,7 @@ from torchrl_sspl.data import Labels
 from torchrl_sspl.errors import ConfigError, EmptyRegionError
 from torchrl_sspl.experiments import Experiment
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
-from torchrl_sspl.trainers import choose_and_spread
+from torchrl_sspl.trainers import Gather, choose_and_spread
 
 
 def box(n: int = 6000) -> tuple[torch.Tensor, torch.Tensor]:
@@ -123,6 +125,17 @@ def test_a_run_asks_for_as_many_labels_as_it_may(tmp_path):
     assert budget["labels of neither"] > 0
     assert int(latents["told"].sum()) == 50
     assert int((latents["region"] == UNSAFE).sum()) > 5 * budget["labels of U"]
+
+
+@pytest.mark.parametrize(("number", "asked"), [(0, 5), (1, 0)])
+def test_labels_are_asked_for_in_the_first_round_alone(number, asked):
+    seen, counted = torch.linspace(-1, 1, 40)[:, None], []
+    told = torch.zeros(40, 1, dtype=torch.bool).index_fill(0, torch.tensor([0, 39]), True)
+    latents = {"seen": seen, "told": told, "answer": torch.where(seen > 0, UNSAFE, SAFE)}
+    source = SimpleNamespace(labels=Labels(safe=1, unsafe=1, choose=5), count_labels=lambda answers: counted.append(len(answers)))
+    Gather(number)._choose(SimpleNamespace(latents=latents, source=source, seen_dim=1))
+    assert counted == [asked]
+    assert int(latents["told"].sum()) == 2 + asked
 
 
 @pytest.mark.parametrize("options", [{"choose": 5}, {"choose": 5, "safe": 3}, {"choose": -1, "safe": 3, "unsafe": 3}])

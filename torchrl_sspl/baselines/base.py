@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, TypeVar
 
 import torch
 from torch import Tensor
@@ -16,6 +16,7 @@ from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import Camera, Decision
 
 Nominal = Callable[[Tensor], Tensor]
+T = TypeVar("T")
 DYNAMICS = ("none", "control-affine", "exact")
 
 
@@ -111,6 +112,7 @@ class SafetyMethod(ABC):
         needs: what it was given, complete after ``fit``.
         notes: figures of its own training.
         directory: where a training of its own may write; None: nowhere.
+        stages: what stages of ``fit`` have learnt, see :meth:`stage`; trials that fit on the same data share it.
         Config: dataclass of its options.
         space: what is tried where it is tuned, values by option.
 
@@ -142,6 +144,21 @@ class SafetyMethod(ABC):
         self.config: Any = config if config is not None or self.Config is None else self.Config()
         self.notes: dict[str, float] = {}
         self.directory: Path | None = None
+        self.stages: dict[tuple[str, ...], Any] = {}
+
+    def stage(self, options: Sequence[str], learn: Callable[[], T]) -> T:
+        """What a stage of ``fit`` learns, or has learnt with the same options; random numbers go on from its end.
+
+        Args:
+            options: names of all options that it reads.
+            learn: returns what later stages read and do not change.
+        """
+        key = tuple(f"{name}={getattr(self.config, name)}" for name in options)
+        if key not in self.stages:
+            self.stages[key] = learn(), torch.get_rng_state()
+        found, state = self.stages[key]
+        torch.set_rng_state(state)
+        return found
 
     @abstractmethod
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:

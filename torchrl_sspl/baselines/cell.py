@@ -183,12 +183,12 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
     options, told = tuning.draws(cell.method, cell.trials), []
     if path.is_file() and (found := json.loads(path.read_text())).get("of") == asked:
         told = found["trials"]
-    env = replace(cell, seed=tuning.SEED).environment()
+    env, stages = replace(cell, seed=tuning.SEED).environment(), dict[tuple[str, ...], Any]()
 
     def trial(words: Sequence[str]) -> float:
         method = make(cell.method, [*cell.options, *words])
         with tempfile.TemporaryDirectory() as where:
-            method.directory = Path(where)
+            method.directory, method.stages = Path(where), stages
             _fit(method, env, cell, tuning.SEED)
             return tuning.merit(method, env, horizon=horizon)
 

@@ -107,10 +107,8 @@ class LatentCBF(OneStepFilter):
         """Autoencoder, dynamics, barrier, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
         self.env, self.alpha, self.offset = env, c.alpha, c.offset
-        self.encoder = BoundedAutoencoder(c.latent, c.gain)
-        self._reconstruct(data, seed)
-        with torch.no_grad():
-            z, after = (torch.cat([self.encoder(p) for p in pixels.split(500)]) for pixels in (data.pixels, data.next_pixels))
+        networks = ("latent", "gain", "autoencoder_steps", "inverse_dynamics")
+        self.encoder, self.notes["reconstruction_loss"], z, after = self.stage(networks, lambda: self._reconstruct(data, seed))
         self.mean, self.scale = z.mean(0), z.std(0).clamp_min(1e-3)
         z, after = (z - self.mean) / self.scale, (after - self.mean) / self.scale
         self.dynamics = ControlAffine(c.latent, env.action_dim, env.dt, env.max_action)  # type: ignore[attr-defined]
@@ -123,9 +121,11 @@ class LatentCBF(OneStepFilter):
         self._learn_barrier(z, data.region, seed)
         self.needs = Needs(**data.labels(), claimed="invariance of {h >= 0} under the learned latent dynamics")
 
-    def _reconstruct(self, data: Recording, seed: int) -> None:
+    def _reconstruct(self, data: Recording, seed: int) -> tuple[BoundedAutoencoder, float, Tensor, Tensor]:
+        """The autoencoder, its loss, and the latents of all pictures and of those that follow."""
+        encoder = BoundedAutoencoder(self.config.latent, self.config.gain)
         median = data.frames[:: max(1, len(data) // 500), 1].float().median(0).values.repeat(2, 1, 1)
-        networks: dict[nn.Module, float] = {self.encoder: 2e-3}
+        networks: dict[nn.Module, float] = {encoder: 2e-3}
         weight = self.config.inverse_dynamics
         inverse = InverseDynamics(self.config.latent, self.env.action_dim, action_scale=self.env.max_action)
         if weight:
@@ -133,18 +133,20 @@ class LatentCBF(OneStepFilter):
 
         def loss(rows: Tensor) -> dict[str, Tensor]:
             pixels = data.frames[rows, :2].flatten(1, 2)
-            z = self.encoder(pixels)
+            z = encoder(pixels)
             wanted = pixels.float()
             heavy = 1.0 + 9.0 * ((wanted - median).abs() > 8.0)
-            terms = {"loss": (heavy * (self.encoder.decode(z) - (wanted / 127.5 - 1.0)).square()).mean()}
+            terms = {"loss": (heavy * (encoder.decode(z) - (wanted / 127.5 - 1.0)).square()).mean()}
             if weight:
-                told = inverse(z, self.encoder(data.frames[rows, 1:].flatten(1, 2)))
+                told = inverse(z, encoder(data.frames[rows, 1:].flatten(1, 2)))
                 terms["loss_inverse"] = weight * ((told - data.action[rows]) / self.env.max_action).square().mean()
             return terms
 
         loop = train(seed, self.config.autoencoder_steps, networks, loss, len(data), 64)
-        self.encoder.eval()
-        self.notes["reconstruction_loss"] = float(loop.loss or 0.0)
+        encoder.eval()
+        with torch.no_grad():
+            z, after = (torch.cat([encoder(p) for p in pixels.split(500)]) for pixels in (data.pixels, data.next_pixels))
+        return encoder, float(loop.loss or 0.0), z, after
 
     def _learn_barrier(self, z: Tensor, region: Tensor, seed: int) -> None:
         c = self.config

@@ -22,7 +22,7 @@ from torchrl_sspl.baselines.base import Budget, Needs, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, pooled
 from torchrl_sspl.baselines.perception import encoder_for, train
 from torchrl_sspl.envs.base import SafetyEnv
-from torchrl_sspl.modules import LatentDynamics
+from torchrl_sspl.modules import FrameEncoder, LatentDynamics
 from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.objectives import SaLaDLoss
 from torchrl_sspl.sets import SAFE, UNSAFE
@@ -64,7 +64,8 @@ class LatentSafe(SafetyMethod):
         c = self.config
         self.env = env
         failed = data.region == UNSAFE
-        self._world(data, torch.where(failed, UNSAFE, SAFE), seed)
+        region = torch.where(failed, UNSAFE, SAFE)
+        self.encoder, self.dynamics, self.notes["world_loss"] = self.stage(("latent", "world_steps"), lambda: self._world(data, region, seed))
         with torch.no_grad():
             z = torch.cat([self.encoder(part) for part in data.pixels.split(500)])
         self.margin = nn.Sequential(mlp((z.shape[1], 64, 64, 64, 1), nn.SiLU))
@@ -80,25 +81,24 @@ class LatentSafe(SafetyMethod):
             transitions=len(data), safe_labels=len(good), unsafe_labels=len(bad), claimed="a value in the learned latent dynamics"
         )
 
-    def _world(self, data: Recording, region: Tensor, seed: int) -> None:
+    def _world(self, data: Recording, region: Tensor, seed: int) -> tuple[FrameEncoder, LatentDynamics, float]:
         c, env = self.config, self.env
         size = c.latent if env.state_dim > 2 else c.latent - 1
-        self.encoder = encoder_for(env, size, data)
-        size = self.encoder.latent_dim
-        self.dynamics = LatentDynamics(size, env.action_dim, (96, 96), env.max_action)
+        encoder = encoder_for(env, size, data)
+        size = encoder.latent_dim
+        dynamics = LatentDynamics(size, env.action_dim, (96, 96), env.max_action)
         salad = SaLaDLoss(
-            None, self.dynamics, mlp((size, 64, 64, 1), nn.SiLU), consistency="online", safety_margin=0.3, safe_coeff=0.3, unsafe_coeff=0.3,
+            None, dynamics, mlp((size, 64, 64, 1), nn.SiLU), consistency="online", safety_margin=0.3, safe_coeff=0.3, unsafe_coeff=0.3,
             consistency_coeff=2.0, inverse_dynamics_coeff=1.0, variance_coeff=0.5, covariance_coeff=0.5, saturation_coeff=0.3,
         )  # fmt: skip
 
         def loss(rows: Tensor) -> dict[str, Tensor]:
-            now, then = self.encoder.sequence(data.frames[rows]).unbind(1)
+            now, then = encoder.sequence(data.frames[rows]).unbind(1)
             body = {"latent": now, "action": data.action[rows], "region": region[rows, None], "next": {"latent": then}}
             return dict(salad(TensorDict(body, [len(rows)])).items())
 
-        loop = train(seed, c.world_steps, {self.encoder: 3e-3, salad: 3e-3}, loss, len(data))
-        self.encoder.eval()
-        self.notes["world_loss"] = float(loop.loss or 0.0)
+        loop = train(seed, c.world_steps, {encoder: 3e-3, salad: 3e-3}, loss, len(data))
+        return encoder.eval(), dynamics, float(loop.loss or 0.0)
 
     def margin_loss(self, good: Tensor, bad: Tensor) -> dict[str, Tensor]:
         """Hinges on the latents of pictures without and with a failure."""

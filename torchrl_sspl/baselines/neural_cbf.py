@@ -91,7 +91,7 @@ class NeuralCBF(OneStepFilter):
         """State from pictures, then barrier and controller on states; see :meth:`SafetyMethod.fit`."""
         c = self.config
         self.env, self.alpha, self.offset = env, c.alpha, c.offset
-        self.eyes = Perception(env, data, c.perception_steps, seed)
+        self.eyes = self.stage(("perception_steps",), lambda: Perception(env, data, c.perception_steps, seed))
         fresh = slice(0, min(1000, len(data)))
         self.notes |= perception_error(self.eyes(data.pixels[fresh]), data.state[fresh], env)
         at = Coordinates(env)

@@ -152,15 +152,26 @@ class VisionCBF(OneStepFilter):
         """Learn to draw the geometry; see :meth:`SafetyMethod.fit`."""
         c = self.config
         self.env, self.alpha, self.offset, self.of = env, c.alpha, c.offset, Geometry(env)
-        self.network, judge = UNet(self.of.channels), nn.Sequential(
+        self.network, self.notes["loss"] = self.stage(("steps", "batch", "adversarial", "plain"), lambda: self._draw(data, seed))
+        fresh = slice(0, min(1000, len(data)))
+        self.notes |= perception_error(self.perceive(data.pixels[fresh]), data.state[fresh], env)
+        self.needs = Needs(
+            transitions=len(data), masks=len(data), dynamics="control-affine",
+            claimed="invariance of the geometric set, for exact geometry and without a bound on the action",
+        )  # fmt: skip
+
+    def _draw(self, data: Recording, seed: int) -> tuple[UNet, float]:
+        """A network that draws the geometry, and its loss."""
+        c = self.config
+        network, judge = UNet(self.of.channels), nn.Sequential(
             nn.Conv2d(6 + self.of.channels, 16, 4, 2, 1), nn.LeakyReLU(0.2), nn.Conv2d(16, 32, 4, 2, 1), nn.LeakyReLU(0.2), nn.Conv2d(32, 1, 3, 1, 1)
         )  # fmt: skip
-        before = env.previous_state(data.state)
+        before = self.env.previous_state(data.state)
 
         def loss(rows: Tensor) -> dict[str, Tensor]:
             seen = data.frames[rows, :2].flatten(1, 2).float() / 127.5 - 1.0
             wanted = self.of.draw(data.state[rows], before[rows])
-            drawn = self.network(seen)
+            drawn = network(seen)
             terms = {"loss_plain": c.plain * (drawn - wanted).abs().mean()}
             if c.adversarial:
                 # One optimiser for both: of the generator's term no gradient reaches the judge's weights, and the other way round.
@@ -171,17 +182,11 @@ class VisionCBF(OneStepFilter):
                 terms["loss_fool"] = F.softplus(-fooled).mean()
             return terms
 
-        networks: dict[nn.Module, float] = {self.network: 2e-3}
+        networks: dict[nn.Module, float] = {network: 2e-3}
         if c.adversarial:
             networks[judge] = 5e-4
         loop = train(seed, c.steps, networks, loss, len(data), c.batch)
-        self.notes["loss"] = float(loop.loss or 0.0)
-        fresh = slice(0, min(1000, len(data)))
-        self.notes |= perception_error(self.perceive(data.pixels[fresh]), data.state[fresh], env)
-        self.needs = Needs(
-            transitions=len(data), masks=len(data), dynamics="control-affine",
-            claimed="invariance of the geometric set, for exact geometry and without a bound on the action",
-        )  # fmt: skip
+        return network, float(loop.loss or 0.0)
 
     @torch.no_grad()
     def perceive(self, seen: Tensor) -> Tensor:
