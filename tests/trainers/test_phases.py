@@ -85,7 +85,7 @@ def uninterrupted(tmp_path_factory):
 def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkpoints):
     whole, expected = uninterrupted
     killed_after(experiment(tmp_path, EVERY_STEP), checkpoints)
-    resumed = experiment(tmp_path, EVERY_STEP)
+    resumed = experiment(tmp_path)
     assert_same(resumed.train(), expected)
     assert resumed.work.checks == whole.work.checks
     assert resumed.work.level == whole.work.level
@@ -115,7 +115,7 @@ def test_what_a_phase_without_steps_had_found_is_not_found_again(tmp_path, unint
     with pytest.raises(Killed):
         experiment(tmp_path, EVERY_STEP).train()
     monkeypatch.setattr(Entry, "saved", counted)
-    resumed = experiment(tmp_path, EVERY_STEP)
+    resumed = experiment(tmp_path)
     assert_same(resumed.train(), expected)
     assert any(taken)
     assert resumed.work.checks == whole.work.checks
@@ -144,7 +144,7 @@ def test_targets_are_not_computed_again_in_the_middle_of_their_fit(tmp_path, uni
     with pytest.raises(Killed):
         killed.train()
     assert computed == [("fit", 0)]
-    assert_same(experiment(tmp_path, EVERY_STEP).train(), expected)
+    assert_same(experiment(tmp_path).train(), expected)
     assert computed.count(("fit", 0)) == 1
     assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
 
@@ -164,7 +164,7 @@ def test_what_was_logged_after_the_last_checkpoint_is_not_logged_twice(tmp_path,
     found.trainer._save_trainer = die_in_place_of_saving  # type: ignore[method-assign]
     with pytest.raises(Killed):
         found.train()
-    experiment(tmp_path, EVERY_STEP).train()
+    experiment(tmp_path).train()
     assert log.read_text() == (uninterrupted[0].directory / "log.jsonl").read_text()
 
 
@@ -172,7 +172,7 @@ def test_a_policy_that_is_taught_first_continues_bit_for_bit_too(tmp_path):
     value = "synthesis.teacher=value"
     expected = experiment(tmp_path / "whole", value).train()
     killed_after(experiment(tmp_path / "killed", value, EVERY_STEP), 14)
-    assert_same(experiment(tmp_path / "killed", value, EVERY_STEP).train(), expected)
+    assert_same(experiment(tmp_path / "killed", value).train(), expected)
 
 
 def test_a_policy_that_chooses_continues_bit_for_bit_too(tmp_path):
@@ -181,7 +181,7 @@ def test_a_policy_that_chooses_continues_bit_for_bit_too(tmp_path):
     assert isinstance(expected.policy, ChoosingPolicy)
     assert expected.policy.actions.flatten().tolist() == [-10.0, 0.0, 10.0]
     killed_after(experiment(tmp_path / "killed", *chooses, EVERY_STEP), 14)
-    assert_same(experiment(tmp_path / "killed", *chooses, EVERY_STEP).train(), expected)
+    assert_same(experiment(tmp_path / "killed", *chooses).train(), expected)
 
 
 def test_targets_on_a_grid_are_the_distance_to_what_is_kept_under_errors(tmp_path, monkeypatch):
@@ -292,7 +292,7 @@ def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
     expected = experiment(tmp_path / "whole", *car).train()
     killed_after(experiment(tmp_path / "killed", *car, EVERY_STEP), 14)
-    assert_same(experiment(tmp_path / "killed", *car, EVERY_STEP).train(), expected)
+    assert_same(experiment(tmp_path / "killed", *car).train(), expected)
 
 
 @pytest.mark.parametrize("encoder", ["BearingEncoder", "ShapeBearingEncoder"])
@@ -403,7 +403,7 @@ def test_retries_resume_exactly_and_end_when_one_passes(tmp_path, monkeypatch):
 
     monkeypatch.setattr(CheckRound, "_held_out", lambda self, work, agent: object())
     monkeypatch.setattr(CheckRound, "_check", found)
-    words = ["synthesis.rounds=1", "synthesis.retries=3", "synthesis.cover_share=0", EVERY_STEP]
+    words = ["synthesis.rounds=1", "synthesis.retries=3", "synthesis.cover_share=0"]
     whole = experiment(tmp_path / "whole", *words)
     agent = whole.train()
     assert [c.round for c in whole.work.checks] == [0, 1, 2]  # the third retry is not needed
@@ -412,14 +412,14 @@ def test_retries_resume_exactly_and_end_when_one_passes(tmp_path, monkeypatch):
     assert sum(row["phase"] == "dynamics" and row["round"] > 0 for row in rows) == 0
     tuned = next(k for k, p in enumerate(whole.phases.phases) if p.number == 2 and p.name == "tune")
     broken = experiment(tmp_path / "broken", *words)
-    save = broken.trainer._save_trainer
+    save = broken.trainer.save_trainer
 
-    def die_while_tuning() -> None:
-        save()
+    def die_while_tuning(force_save: bool = False) -> None:
         if broken.phases.done == tuned and broken.work.loop.step == 2:
+            save(force_save=True)
             raise Killed
 
-    broken.trainer._save_trainer = die_while_tuning  # type: ignore[method-assign]
+    broken.trainer.save_trainer = die_while_tuning  # type: ignore[method-assign]
     with pytest.raises(Killed):
         broken.train()
     assert_same(experiment(tmp_path / "broken", *words).train(), agent)

@@ -158,6 +158,6 @@ def test_it_resumes_bit_for_bit_with_the_pictures_that_are_needed(tmp_path, unin
     killed = experiment(tmp_path, *STEADY, EVERY_STEP)
     killed_after(killed, checkpoints)
     assert killed.work.where["phase"] == phase
-    resumed = experiment(tmp_path, *STEADY, EVERY_STEP)
+    resumed = experiment(tmp_path, *STEADY)
     assert_same(resumed.train(), expected)
     assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
