@@ -50,7 +50,7 @@ def test_chosen_labels_tell_where_u_ends_better_than_as_many_random_ones():
 
 
 def test_many_labels_are_interpolated_from_those_nearby(monkeypatch):
-    z, answer = box()
+    z, answer = box(1500)
     told = torch.arange(len(z)) < 400
     whole = choose_and_spread(z, told, answer, 0)[0]
     monkeypatch.setattr("torchrl_sspl.trainers.asking._MOST", 399)
