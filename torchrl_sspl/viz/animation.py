@@ -265,7 +265,8 @@ class _Level:
         for value in self.third:
             cut = dataclasses.replace(plane, fixed={2: float(value)}) if plane.dim == 3 else plane
             self.x, self.y, table = cut.grid(states, {"v": values})
-            self.tables.append(table["v"])
+            self.tables.append(table["v"].astype(float))
+        self.level = 0.5 if table["v"].dtype == bool else 0.0
 
     def collection(self) -> Any:
         """The line, still empty."""
@@ -283,8 +284,8 @@ class _Level:
             following = self.third[k + 1] if k + 1 < len(self.third) else self.third[0] + self.period
             share = (at - self.third[k]) / max(following - self.third[k], 1e-9)
             table = self.tables[k] + min(share, 1.0) * (self.tables[(k + 1) % len(self.tables)] - self.tables[k])
-        contours = require("contourpy").contour_generator(self.x, self.y, table.astype(float))
-        self.lines.set_segments(contours.lines(0.5 if table.dtype == bool else 0.0))
+        contours = require("contourpy").contour_generator(self.x, self.y, table)
+        self.lines.set_segments(contours.lines(self.level))
 
 
 def _checked(take: Take, plane: Plane | None) -> Take:
