@@ -153,6 +153,15 @@ def test_experiments_train_on_the_gpu(options, tmp_path):
     assert all(torch.isfinite(p).all() for p in experiment.loss.parameters())
 
 
+@pytest.fixture
+def deterministic(monkeypatch):
+    """Kernels that add in a fixed order: others give two runs with one seed different encoders on a GPU."""
+    monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
+    torch.use_deterministic_algorithms(True, warn_only=True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
 def saving_experiment(directory: Path, device: str) -> Experiment:
     return Experiment(compose([*JOINT, "trainer.checkpoint_seconds=0", f"device={device}", f"out_dir={directory}"]))
 
@@ -171,7 +180,7 @@ def interrupt(experiment: Experiment) -> None:
     experiment.train()
 
 
-def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(tmp_path):
+def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(deterministic, tmp_path):
     whole = saving_experiment(tmp_path / "whole", "cuda")
     whole.train()
     with pytest.raises(InterruptedError):
@@ -215,7 +224,7 @@ def test_all_phases_learn_from_pixels_on_the_gpu(words, phases, tmp_path):
     assert experiment.phases.finished
 
 
-def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(tmp_path):
+def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(deterministic, tmp_path):
     words = [*TINY, "synthesis.rounds=1", "trainer.checkpoint_seconds=0", "device=cuda"]
     whole = Experiment(compose([*words, f"out_dir={tmp_path / 'whole'}"])).train()
     broken = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"]))
