@@ -100,7 +100,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def figure(out: Path) -> Path:
-    """Draws volume and false-safe share of all points below ``out`` with right labels, two panels for each system; returns the picture."""
+    """Draws volume, share of U called safe and false-safe share of all points below ``out`` with right labels, two panels for each system; returns the picture."""
     rows = [json.loads(path.read_text()) for path in sorted(out.rglob("point.json"))]
     rows = [row for row in rows if not row["wrong"] and tuple(row["starts"]) == Point.starts]
     if not rows:
@@ -108,18 +108,21 @@ def figure(out: Path) -> Path:
     for row in rows:
         row["labels known"] = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
         chosen = [o.partition("=")[2] for o in row["options"] if o.startswith("labels.choose=")]
-        row["chosen"] = f", {chosen[0]} of them chosen" if chosen else ""
+        row["chosen"] = f", {chosen[0]} labels chosen" if chosen else ""
+
+    def several_of(row: dict[str, Any]) -> str:
+        return f"{row['labels']} labels of S and of U{row['chosen']}"
+
     systems = sorted({row["env"] for row in rows})
     drawn = new_figure(9, 2.9 * len(systems))
     for env, (left, right) in zip(systems, drawn.subplots(len(systems), 2, squeeze=False), strict=True):
         of_env = [row for row in rows if row["env"] == env]
         _panel(left, of_env, "labels known", "labels", lambda row: f"{row['transitions']:,} transitions{row['chosen']}")
-        varied = {row["transitions"] for row in of_env}
-        several = [row for row in of_env if {r["transitions"] for r in of_env if r["labels"] == row["labels"]} == varied]
-        _panel(right, several, "transitions", "transitions", lambda row: f"{row['labels']} labels of S and of U{row['chosen']}")
+        several = [row for row in of_env if len({r["transitions"] for r in of_env if several_of(r) == several_of(row)}) > 1]
+        _panel(right, several, "transitions", "transitions", lambda row: several_of(row))
         left.set(xlabel="labelled pictures", ylabel="%", title=env)
         right.set(xlabel="transitions", title=env)
-    drawn.suptitle("Solid, discs: volume over that of the kernel. Dotted, squares: false-safe share. Filled: held-out checks pass.", fontsize=8)
+    drawn.suptitle("Solid, discs: volume over that of the kernel. Dashed, triangles: share of U called safe. Dotted, squares: false-safe share. Filled: held-out checks pass.", fontsize=8)
     path = out / "few_labels.png"
     drawn.savefig(path, dpi=150)
     return path
@@ -129,7 +132,7 @@ def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callab
     """One mark for each training over ``x``, and lines through the means of those that share a name and a place."""
     names = sorted({name(row) for row in rows})
     for colour, label in zip(PATH_COLOURS, names, strict=False):
-        for measure, mark, style in (("claimed_over_kernel", "o", "-"), ("false_safe", "s", ":")):
+        for measure, mark, style in (("claimed_over_kernel", "o", "-"), ("unsafe_called_safe", "^", "--"), ("false_safe", "s", ":")):
             groups: dict[Any, list[tuple[float, float]]] = {}
             for row in (row for row in rows if name(row) == label and row["measurements"][measure]["value"] is not None):
                 at = row[x], 100 * row["measurements"][measure]["value"]

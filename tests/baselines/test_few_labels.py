@@ -45,13 +45,13 @@ def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, 
     assert [path.stat().st_mtime_ns for path in sorted(tmp_path.rglob("point.json"))] == before
 
 
-def point(out: Path, labels: str, transitions: int, volume: float | None, *, passed: bool, wrong: float = 0.0) -> None:
-    path = out / f"{labels}-{transitions}-{wrong}" / "point.json"
+def point(out: Path, labels: str, transitions: int, volume: float | None, *, passed: bool, wrong: float = 0.0, options: tuple[str, ...] = ()) -> None:
+    path = out / f"{labels}-{transitions}-{wrong}-{len(options)}" / "point.json"
     path.parent.mkdir(parents=True)
     counts = {"safe_labels": 100, "unsafe_labels": 100, "neither_labels": 0}
-    measured = {"claimed_over_kernel": {"value": volume}, "false_safe": {"value": None}}
+    measured = {"claimed_over_kernel": {"value": volume}, "false_safe": {"value": None}, "unsafe_called_safe": {"value": 0.1}}
     path.write_text(json.dumps({
-        "env": "pendulum", "labels": labels, "transitions": transitions, "wrong": wrong, "seed": 0, "options": [], "starts": [0.6, 0.15, 0.25],
+        "env": "pendulum", "labels": labels, "transitions": transitions, "wrong": wrong, "seed": 0, "options": options, "starts": [0.6, 0.15, 0.25],
         "passed": passed, "needs": counts, "measurements": measured,
     }))  # fmt: skip
 
@@ -61,14 +61,17 @@ def test_the_figure_shows_every_training_and_which_of_them_pass(tmp_path, monkey
     point(tmp_path, "all", 20_000, 0.7, passed=False)
     point(tmp_path, "100", 2_000, None, passed=False)
     point(tmp_path, "100", 20_000, 0.9, passed=True, wrong=0.01)
+    point(tmp_path, "100", 20_000, 0.8, passed=True, options=("labels.choose=40",))
     figure = runpy.run_path(str(BENCHMARK))["figure"]
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, path, **look: drawn.append(self))
     drawn: list = []
     figure(tmp_path)
     left, right = drawn[0].axes
     marks = [line for line in left.lines if line.get_marker() == "o"]
-    assert sorted(line.get_ydata()[0] for line in marks) == [50.0, 70.0]  # a wrong label makes another figure
+    assert sorted(line.get_ydata()[0] for line in marks) == [50.0, 70.0, 80.0]  # a wrong label makes another figure
     assert {line.get_ydata()[0] for line in marks if line.get_markerfacecolor() == "white"} == {70.0}
+    assert {line.get_ydata()[0] for line in left.lines if line.get_marker() == "^"} == {10.0}
+    # Those of which 40 labels are chosen have one number of transitions.
     assert [text.get_text() for text in right.get_legend().get_texts()] == ["100 labels of S and of U"]
 
 
