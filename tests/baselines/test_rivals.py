@@ -34,7 +34,7 @@ TINY = {
     "latent_safe": ["world_steps=4", "margin_steps=6", "steps=6", "batch=32"],
     "smooth_latent": ["world_steps=4", "margin_steps=6", "steps=6", "batch=32"],
 }
-SIZES = ScoreConfig(episodes=6, horizon=4, grid=9, frames=2)
+SIZES = ScoreConfig(episodes=6, horizon=4, grid=9, frames=2, shifted=20)
 
 
 @pytest.fixture(scope="module")
@@ -93,7 +93,7 @@ def test_the_shipped_agent_is_a_row_with_its_memory(systems):
     for options in (["agent=pendulum"], ["agent=pendulum", "filter=true"]):
         method = make("sspl", options)
         method.fit(None, env, BUDGETS["tiny"], 0)
-        found = score(method, env, ScoreConfig(episodes=20, horizon=10, grid=41, frames=2), kernel=kernel)
+        found = score(method, env, ScoreConfig(episodes=20, horizon=10, grid=41, frames=2, shifted=20), kernel=kernel)
         assert found["claimed_over_kernel"] > 0.5
         assert found["false_safe"] < 0.05
         assert found["claimed_harmless_enter"] == 0.0
