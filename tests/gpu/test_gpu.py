@@ -225,15 +225,16 @@ def test_all_phases_learn_from_pixels_on_the_gpu(words, phases, tmp_path):
 
 
 def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(deterministic, tmp_path):
-    words = [*TINY, "synthesis.rounds=1", "trainer.checkpoint_seconds=0", "device=cuda"]
+    words = [*TINY, "synthesis.rounds=1", "trainer.checkpoint_seconds=3600", "device=cuda"]
     whole = Experiment(compose([*words, f"out_dir={tmp_path / 'whole'}"])).train()
     broken = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"]))
     save = broken.trainer.save_trainer
 
     def stop_in_steer(force_save=False):
-        save(force_save)
         if broken.work.where["phase"] == "steer":
+            save(force_save=True)
             raise InterruptedError
+        save(force_save)
 
     broken.trainer.save_trainer = stop_in_steer
     with pytest.raises(InterruptedError):
