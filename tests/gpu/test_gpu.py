@@ -155,7 +155,7 @@ def test_experiments_train_on_the_gpu(options, tmp_path):
 
 @pytest.fixture
 def deterministic(monkeypatch):
-    """Kernels that add in a fixed order: others give two runs with one seed different encoders on a GPU."""
+    """Kernels that add in a fixed order: without, the encoders of two runs with one seed differed on a GPU."""
     monkeypatch.setenv("CUBLAS_WORKSPACE_CONFIG", ":4096:8")
     torch.use_deterministic_algorithms(True, warn_only=True)
     yield
