@@ -110,7 +110,7 @@ def figure(out: Path) -> Path:
         chosen = [o.partition("=")[2] for o in row["options"] if o.startswith("labels.choose=")]
         row["chosen"] = f", {chosen[0]} labels chosen" if chosen else ""
 
-    def several_of(row: dict[str, Any]) -> str:
+    def labels_of(row: dict[str, Any]) -> str:
         return f"{row['labels']} labels of S and of U{row['chosen']}"
 
     systems = sorted({row["env"] for row in rows})
@@ -118,8 +118,8 @@ def figure(out: Path) -> Path:
     for env, (left, right) in zip(systems, drawn.subplots(len(systems), 2, squeeze=False), strict=True):
         of_env = [row for row in rows if row["env"] == env]
         _panel(left, of_env, "labels known", "labels", lambda row: f"{row['transitions']:,} transitions{row['chosen']}")
-        several = [row for row in of_env if len({r["transitions"] for r in of_env if several_of(r) == several_of(row)}) > 1]
-        _panel(right, several, "transitions", "transitions", lambda row: several_of(row))
+        several = [row for row in of_env if len({r["transitions"] for r in of_env if labels_of(r) == labels_of(row)}) > 1]
+        _panel(right, several, "transitions", "transitions", labels_of)
         left.set(xlabel="labelled pictures", ylabel="%", title=env)
         right.set(xlabel="transitions", title=env)
     drawn.suptitle("Solid, discs: volume over that of the kernel. Dashed, triangles: share of U called safe. Dotted, squares: false-safe share. Filled: held-out checks pass.", fontsize=8)

@@ -239,7 +239,9 @@ def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(determin
     broken.trainer.save_trainer = stop_in_steer
     with pytest.raises(InterruptedError):
         broken.train()
-    found = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"])).train().state_dict()
+    resumed = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"]))
+    found = resumed.train().state_dict()
+    assert resumed.trainer.resumed
     for key, value in whole.state_dict().items():
         torch.testing.assert_close(value, found[key], msg=key)
 
