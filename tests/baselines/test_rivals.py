@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from tiny import TINY as TINY_RUN
 
 from torchrl_sspl.baselines import BUDGETS, METHODS, Budget, ScoreConfig, make, record, score
 from torchrl_sspl.baselines.base import nearest_admissible
@@ -243,6 +244,28 @@ def test_this_librarys_own_row_takes_as_many_steps_as_recommended_whatever_the_b
         run = Experiment(compose([*settings(system, BUDGETS[name]), f"out_dir={tmp_path}/{name}", *quiet]))
         assert run.trainer._joint_steps() == usual
         assert run.config.trainer.total_frames <= BUDGETS[name].total + run.config.collector.frames_per_batch
+
+
+@pytest.mark.parametrize("budget", [BUDGETS["full"], Budget("try", 20_000, 3_000, 4_000, rollouts=9_000)], ids=["full", "less"])
+@pytest.mark.parametrize("system", ["pendulum", "dubins"])
+def test_this_librarys_own_row_takes_no_more_transitions_than_the_budget_has(system, budget):
+    config = compose(settings(system, budget))
+    taken, rollouts = taken_at_most(config)
+    assert 0 < rollouts <= budget.rollouts
+    assert budget.total - budget.rollouts <= taken <= budget.total
+
+
+def taken_at_most(config) -> tuple[int, int]:
+    """Transitions of a training without a grid, and those of them that its rounds ask for."""
+    s, further = config.synthesis, config.synthesis.rounds - 1
+    rollouts = s.rollout_transitions * (s.near_draws * further + (s.gain < 1.0)) + s.rim_draws * s.rim_transitions * further
+    return max(s.transitions, config.trainer.total_frames) + rollouts, rollouts
+
+
+def test_a_training_takes_what_is_asked_for(tmp_path):
+    run = Experiment(compose([*TINY_RUN, "synthesis.near_draws=1", f"out_dir={tmp_path}"]))
+    run.train()
+    assert run.work.source.budget["transitions"] == taken_at_most(run.config)[0]
 
 
 def test_a_heavier_hinge_is_another_barrier(systems):

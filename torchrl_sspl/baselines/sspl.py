@@ -45,7 +45,14 @@ def settings(system: str, budget: Budget) -> list[str]:
     frames = -(-first // batch) * batch
     plan = [f"env={system}", f"collector.starts={[round(s / sum(shares), 4) for s in shares]}"]
     if budget.rollouts:
-        return [*plan, f"trainer.total_frames={min(frames, most)}", f"synthesis.transitions={first}"]
+        # Rollouts as recommended where the budget has them; those from U that a further round draws share the rest.
+        further, s = max(1, usual.synthesis.rounds - 1), usual.synthesis
+        rollouts = min(s.rollout_transitions, budget.rollouts // further)
+        rim = min(s.rim_transitions, (budget.rollouts // further - rollouts) // s.rim_draws)
+        return [
+            *plan, f"trainer.total_frames={min(frames, most)}", f"synthesis.transitions={first}",
+            f"synthesis.rollout_transitions={rollouts}", "synthesis.near_draws=1", f"synthesis.rim_transitions={rim}",
+        ]  # fmt: skip
     # As many steps as the recommended settings take, all of them when everything is recorded.
     learning = -(-most // batch) - -(-usual.random_frames() // batch) + 1
     steps = usual.trainer.optim_steps_per_batch * learning

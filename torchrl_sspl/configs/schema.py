@@ -30,7 +30,7 @@ _LEAST = {
     "synthesis.teach_steps synthesis.fit_steps synthesis.steer_steps synthesis.tune_steps synthesis.tighten_steps synthesis.dynamics_outlier "
     "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices synthesis.retries",
     1: "evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.batch synthesis.residuals synthesis.actions "
-    "synthesis.rim_draws synthesis.check_episodes synthesis.check_horizon",
+    "synthesis.rim_draws synthesis.near_draws synthesis.check_episodes synthesis.check_horizon",
     4: "synthesis.turns",
 }
 
@@ -193,7 +193,8 @@ class SynthesisConfig:
         "where the environment knows its sets, further ones under random actions. Of more than that, all that start "
         "in S or U, at most half of them, and others at random.")
     rollout_transitions: int = _option(20_000, "transitions of the policy (with exploration) that every further round "
-        "adds.")
+        "adds: those near the set, of near_draws times as many at most.")
+    near_draws: int = _option(10, "see rollout_transitions; 1 bounds what a training takes by what is asked for.")
     rim_transitions: int = _option(8_000, "transitions that start in U that every further round adds: of rim_draws "
         "times as many those whose pictures the barrier puts lowest.")
     rim_draws: int = _option(5, "see rim_transitions.")

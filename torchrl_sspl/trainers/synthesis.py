@@ -121,7 +121,7 @@ class Gather(Phase):
         s, source = work.config, work.source
         found: list[dict[str, Tensor]] = []
         count = 0
-        for attempt in range(10):
+        for attempt in range(s.near_draws):
             part = self._rollouts(work, 20 * self.number + attempt, work.gain)
             with torch.no_grad():
                 near = work.barrier(work.filtered(part)["latent"])[:, 0] < _NEAR
