@@ -18,3 +18,6 @@ TINY = [
     "synthesis.rim_transitions=16", "synthesis.rim_draws=2", "synthesis.check_episodes=8", "synthesis.check_horizon=2",
     "synthesis.counterexamples=8",
 ]  # fmt: skip
+
+#: The same in one round from which nothing goes on.
+SINGLE = [*TINY, "synthesis.rounds=1", "trainer.checkpoint_seconds=-1"]

@@ -121,7 +121,8 @@ def test_the_imitator_is_told_about_what_it_visits(systems):
 
 
 def test_its_own_training_takes_the_budget_and_no_rollouts(tmp_path, systems):
-    sizes = "overrides=[preset=smoke,synthesis.check_episodes=20,trainer.optim_steps_per_batch=2,env.image_size=32]"
+    steps = ",".join(f"synthesis.{name}_steps=4" for name in ("dynamics", "teach", "fit", "steer", "tune"))
+    sizes = f"overrides=[preset=smoke,{steps},synthesis.check_episodes=20,trainer.optim_steps_per_batch=2,env.image_size=32]"
     method = make("sspl", [sizes])
     method.directory = tmp_path
     env = PendulumEnv([4], image_size=32)
@@ -263,7 +264,7 @@ def taken_at_most(config) -> tuple[int, int]:
 
 
 def test_a_training_takes_what_is_asked_for(tmp_path):
-    run = Experiment(compose([*TINY_RUN, "synthesis.near_draws=1", f"out_dir={tmp_path}"]))
+    run = Experiment(compose([*TINY_RUN, "trainer.checkpoint_seconds=-1", "synthesis.near_draws=1", f"out_dir={tmp_path}"]))
     run.train()
     assert run.work.source.budget["transitions"] == taken_at_most(run.config)[0]
 

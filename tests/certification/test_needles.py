@@ -325,9 +325,8 @@ def false_and_missed(seed: int) -> tuple[int, int, int]:
     return false, int(loose.status != "proved"), claims
 
 
-@pytest.mark.parametrize("first", range(0, 60, 20))
-def test_random_closed_loops_are_never_proved_to_do_what_a_grid_shows_they_do_not(first):
-    found = [false_and_missed(seed) for seed in range(first, first + 20)]
+def test_random_closed_loops_are_never_proved_to_do_what_a_grid_shows_they_do_not():
+    found = [false_and_missed(seed) for seed in range(20)]
     assert sum(false for false, _, _ in found) == 0
     assert sum(missed for _, missed, _ in found) <= 4  # true claims are proved: the bounds do say something
 

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 from tensordict import TensorDict
+from tiny import SINGLE
 
 from torchrl_sspl.configs import compose
 from torchrl_sspl.data import Augmentation, TransitionStore
@@ -120,7 +121,7 @@ def test_an_episode_that_is_stored_has_one_camera_and_every_frame_one_change():
 
 
 def test_a_training_sees_changed_pictures_and_another_one_the_same(tmp_path):
-    words = ["env=pendulum", "preset=smoke", "synthesis.enabled=false", "logger=none", "trainer.progress=false", "evaluation.episodes=0"]
+    words = [*SINGLE, "synthesis.enabled=false", "evaluation.episodes=0"]
 
     def frames(name, *more):
         run = Experiment(compose([*words, f"out_dir={tmp_path / name}", *more]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 from tensordict import TensorDict
+from tiny import SINGLE
 
 from torchrl_sspl.configs import compose
 from torchrl_sspl.data import Labels, TransitionStore, collect_random
@@ -94,14 +95,14 @@ class _Mean(torch.nn.Module):
 
 
 def test_a_run_uses_no_more_labels_than_it_may(tmp_path):
-    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false", "synthesis.rounds=1"]
+    words = [*SINGLE, f"out_dir={tmp_path}"]
     run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11"]))
     run.train()
     budget = run.work.source.budget
     assert budget["transitions"] > 100
     assert budget["labels of S"] == 9
     assert budget["labels of U"] == 11
-    assert Experiment(compose([*words[:3], f"out_dir={tmp_path}/plain"])).labels is None
+    assert Experiment(compose([*SINGLE, f"out_dir={tmp_path}/plain"])).labels is None
 
 
 @pytest.mark.parametrize("options", [{"safe": -1}, {"wrong": 1.5}])

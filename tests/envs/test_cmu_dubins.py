@@ -8,6 +8,7 @@ import math
 import numpy as np
 import pytest
 import torch
+from tiny import SINGLE
 from torchrl.envs.utils import check_env_specs
 
 from torchrl_sspl.configs import compose
@@ -135,7 +136,7 @@ def test_values_that_are_none_are_refused():
 
 
 def test_the_settings_train_this_car_from_its_pictures_alone(tmp_path):
-    config = compose(["env=cmu", "preset=smoke", "synthesis.rounds=1", "env.image_size=64", "network.pool_to=32", f"out_dir={tmp_path}"])
+    config = compose(["env=cmu", *(word for word in SINGLE if not word.startswith("env")), "env.image_size=64", "network.pool_to=32", f"out_dir={tmp_path}"])
     experiment = Experiment(config)
     assert isinstance(experiment.env, CMUDubinsEnv)
     agent = experiment.train()

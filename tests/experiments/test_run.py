@@ -55,6 +55,9 @@ SMALL = [
 ]  # fmt: skip
 
 
+UNSAVED = "trainer.checkpoint_seconds=-1"  # where nothing goes on
+
+
 def everywhere(batch_size, seed, below=13) -> GymnasiumPixels:
     return lane(batch_size, seed, reset_options={"below": below})
 
@@ -105,7 +108,7 @@ def nothing() -> SimpleNamespace:
 
 
 def test_without_success_it_starts_again_with_other_weights_and_says_so(tmp_path):
-    words = ["trainer.total_frames=320", "trainer.restarts=2", "optim.lr=0.0", "synthesis.enabled=false"]
+    words = ["trainer.total_frames=320", "trainer.restarts=2", "optim.lr=0.0", "synthesis.enabled=false", UNSAVED]
     experiment = build(tmp_path, *words)
     starts = []
     experiment.trainer.register_op("post_steps", lambda: starts.append(next(experiment.encoder.parameters()).sum().item()))
@@ -162,7 +165,7 @@ def test_a_set_that_is_never_seen(never, tmp_path):
     def env(batch_size, seed):
         return GymnasiumPixels(Lane, batch_size=batch_size, seed=seed, image_size=16, reset_options={"below": 13}, **sets)
 
-    words = [*SMALL, f"buffer.{never}=0", "trainer.total_frames=128", f"out_dir={tmp_path}"]
+    words = [*SMALL, f"buffer.{never}=0", "trainer.total_frames=128", UNSAVED, f"out_dir={tmp_path}"]
     experiment = Experiment(compose(words), env)
     experiment.train()
     assert ("0 of 128 transitions start in U" in "".join(experiment.work.warnings)) == (never == "unsafe")
@@ -170,7 +173,7 @@ def test_a_set_that_is_never_seen(never, tmp_path):
 
 
 def test_of_many_transitions_those_of_the_sets_come_first(tmp_path):
-    experiment = build(tmp_path, "trainer.total_frames=256")
+    experiment = build(tmp_path, "trainer.total_frames=256", UNSAVED)
     experiment.train()
     source, region = experiment.work.source, experiment.store.region
     few = source.stored(100)["region"][:, 0]
@@ -180,7 +183,7 @@ def test_of_many_transitions_those_of_the_sets_come_first(tmp_path):
 
 
 def test_the_budget_counts_what_was_seen(tmp_path):
-    experiment = build(tmp_path, "trainer.total_frames=256")
+    experiment = build(tmp_path, "trainer.total_frames=256", UNSAVED)
     experiment.train()
     budget, region = experiment._budget(), experiment.store.region
     assert budget["transitions"] == 256

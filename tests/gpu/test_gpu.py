@@ -117,6 +117,7 @@ def test_loss_trains_in_a_loop_of_ones_own():
     assert any("target" not in key for key in moved)
 
 
+@pytest.mark.slow
 def test_compiled_loss_is_the_eager_one():
     loss, data = make_loss().cuda(), make_batch().cuda()
     compiled = torch.compile(loss, fullgraph=True)(data)
@@ -131,6 +132,7 @@ def test_mixed_precision_stays_near():
     assert abs(float(total(mixed)) / float(total(loss(data))) - 1.0) < 0.1
 
 
+@pytest.mark.slow
 def test_experiments_run_on_the_gpu_and_return_an_agent_on_the_cpu(tmp_path):
     outcome = Experiment(compose([*JOINT, "device=cuda", f"out_dir={tmp_path}"])).run()
     assert all(not p.is_cuda for p in outcome.agent.parameters())
@@ -180,6 +182,7 @@ def interrupt(experiment: Experiment) -> None:
     experiment.train()
 
 
+@pytest.mark.slow
 def test_interrupted_experiment_goes_on_as_if_nothing_had_happened(deterministic, tmp_path):
     whole = saving_experiment(tmp_path / "whole", "cuda")
     whole.train()
@@ -284,6 +287,7 @@ def pair() -> tuple[Agent, Agent]:
     return load("pendulum"), load("pendulum", "cuda")
 
 
+@pytest.mark.slow
 def test_measurements_on_the_true_system_are_those_of_the_cpu(pair):
     env = PendulumEnv(batch_size=[1])
     states = env.sample_states(100, torch.Generator().manual_seed(0))

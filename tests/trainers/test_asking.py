@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from tiny import SINGLE
 
 from torchrl_sspl.configs import compose
 from torchrl_sspl.data import Labels
@@ -117,8 +118,7 @@ def test_labels_of_one_side_alone_are_refused(codes):
 
 
 def test_a_run_asks_for_as_many_labels_as_it_may(tmp_path):
-    words = ["env=pendulum", "preset=smoke", "logger=none", f"out_dir={tmp_path}", "trainer.progress=false", "synthesis.rounds=1"]
-    run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11", "labels.choose=30"]))
+    run = Experiment(compose([*SINGLE, f"out_dir={tmp_path}", "synthesis.transitions=800", "labels.safe=9", "labels.unsafe=11", "labels.choose=30"]))
     run.train()
     budget, latents = run.work.source.budget, run.work.latents
     assert budget["labels of S"] + budget["labels of U"] + budget["labels of neither"] == 9 + 11 + 30

@@ -15,6 +15,7 @@ import re
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any, Union, get_args, get_origin, get_type_hints
 
@@ -139,9 +140,8 @@ def _set(node: Any, key: str, given: Any, kind: Any) -> None:
     """Assign a value of the declared type; text is parsed as YAML where no text is wanted."""
     if kind is None:
         raise _unknown(key, valid_keys(OmegaConf.to_object(node)))  # type: ignore[arg-type]
-    cell = dataclasses.make_dataclass("Cell", [("value", kind)])
     try:
-        value = OmegaConf.to_container(OmegaConf.structured(cell(_read(key, given, kind))))["value"]  # type: ignore[index, call-overload]
+        value = OmegaConf.to_container(OmegaConf.structured(_cell(kind)(_read(key, given, kind))))["value"]  # type: ignore[index, call-overload]
         if isinstance(value, float) and math.isnan(value):
             raise ValueError("not a number")
         OmegaConf.update(node, key, value, merge=False)
@@ -149,6 +149,12 @@ def _set(node: Any, key: str, given: Any, kind: Any) -> None:
         several = isinstance(given, str) and "," in given and get_origin(_plain(kind)[0]) is not list
         more = "; `sspl train --multirun` runs each of several values" if several else ""
         raise ConfigError(f"expected {key} to be {_name(kind)}, received {given!r:.80}{more}") from error
+
+
+@cache
+def _cell(kind: Any) -> Any:
+    """Class with one value of a kind, of which there are few and many values."""
+    return dataclasses.make_dataclass("Cell", [("value", kind)])
 
 
 def _read(key: str, given: Any, kind: Any) -> Any:

@@ -123,7 +123,7 @@ def certify(
 
     Example:
         >>> from torchrl_sspl.modules.agent import load
-        >>> certificate = certify(load("pendulum"), None, level=0.0, budget=Budget(boxes=1000))  # 40,000 boxes prove all of it
+        >>> certificate = certify(load("pendulum"), None, level=0.0, budget=Budget(boxes=100))  # 40,000 boxes prove all of it
         >>> {s.name: s.holds for s in certificate.layers["deterministic"].statements if s.name in ("Lipschitz constant", "invariance")}
         {'Lipschitz constant': True, 'invariance': False}
     """
@@ -172,7 +172,7 @@ def certify_on_episodes(
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
         >>> from torchrl_sspl.modules.agent import load
-        >>> short = {"episodes": 4, "horizon": 3, "envs": 4, "budget": Budget(boxes=1000)}  # nothing is proved with so little effort
+        >>> short = {"episodes": 4, "horizon": 3, "envs": 4, "budget": Budget(boxes=10)}  # nothing is proved with so little effort
         >>> certificate = certify_on_episodes(load("pendulum"), PendulumEnv, **short)
         >>> sorted(certificate.layers)
         ['deterministic', 'paper', 'run-time', 'statistical']
