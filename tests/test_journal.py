@@ -297,7 +297,7 @@ def test_blocks_of_a_certificate_are_not_drawn_again(tmp_path, monkeypatch):
 
     def layers(name, horizon=2):
         with journal(tmp_path / name, "run"):
-            found = module_of_certify.certify(agent, env, level=0.0, episodes=600, horizon=horizon, budget=Budget(boxes=1))
+            found = module_of_certify.certify(agent, env, level=0.0, episodes=300, horizon=horizon, budget=Budget(boxes=1))
         return {k: [(s.name, s.value, s.n) for s in layer.statements] for k, layer in found.layers.items()}, found.record
 
     with monkeypatch.context() as patch:

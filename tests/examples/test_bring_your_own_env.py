@@ -13,10 +13,10 @@ import pytest
 import torch
 from tiny import TINY_PHASES
 
-from torchrl_sspl.configs import EvaluationConfig
+from torchrl_sspl.configs import EvaluationConfig, compose
 from torchrl_sspl.errors import CheckpointError, EmptyRegionError
 from torchrl_sspl.evaluation import evaluate_episodes, verify_run
-from torchrl_sspl.experiments.run import run_experiment
+from torchrl_sspl.experiments.run import Experiment, run_experiment
 from torchrl_sspl.modules.agent import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
@@ -104,8 +104,8 @@ def test_the_program_of_the_page_is_one():
 
 def test_the_same_seed_gives_the_same_agent(example, tmp_path):
     module = example("bring_your_own_cartpole.py")
-    runs = [run_experiment(module.my_env, TINY, out_dir=str(tmp_path / k)) for k in "ab"]
-    first, second = (run.agent.state_dict() for run in runs)
+    agents = [Experiment(compose([*TINY, f"out_dir={tmp_path / k}"]), module.my_env).train() for k in "ab"]
+    first, second = (agent.state_dict() for agent in agents)
     assert all((first[name] == second[name]).all() for name in first)
 
 

@@ -70,7 +70,7 @@ class Stopped(Exception):
     pass
 
 
-@pytest.mark.parametrize("restarts", [0, 1])
+@pytest.mark.parametrize("restarts", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_a_stopped_experiment_goes_on_to_the_same_agent(restarts, tmp_path):
     words = ["trainer.total_frames=256", f"trainer.restarts={restarts}"]
     straight = build(tmp_path / "straight", *words).train()

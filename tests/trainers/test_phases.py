@@ -81,7 +81,7 @@ def uninterrupted(tmp_path_factory):
     return found, found.train()
 
 
-@pytest.mark.parametrize("checkpoints", [2, 4, 8, 21, 27, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 3, 13)]])
+@pytest.mark.parametrize("checkpoints", [4, 21, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3, 8, 13, 27)]])
 def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkpoints):
     whole, expected = uninterrupted
     killed_after(experiment(tmp_path, EVERY_STEP), checkpoints)
@@ -149,7 +149,7 @@ def test_targets_are_not_computed_again_in_the_middle_of_their_fit(tmp_path, uni
     assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()
 
 
-@pytest.mark.parametrize("checkpoints", [3, 15])
+@pytest.mark.parametrize("checkpoints", [pytest.param(3, marks=pytest.mark.slow), 15])
 def test_what_was_logged_after_the_last_checkpoint_is_not_logged_twice(tmp_path, uninterrupted, checkpoints):
     found = experiment(tmp_path, EVERY_STEP)
     left, save, log = [checkpoints], found.trainer._save_trainer, tmp_path / "log.jsonl"
@@ -286,7 +286,7 @@ def test_targets_on_a_grid_are_settled_in_place_of_a_fine_tuning():
     assert [type(phase) for phase in as_fitted] == kinds[:-1]
 
 
-@pytest.mark.parametrize(("encoder", "p"), [("BearingEncoder", 3), ("TurnedBearingEncoder", 5)])
+@pytest.mark.parametrize(("encoder", "p"), [pytest.param("BearingEncoder", 3, marks=pytest.mark.slow), ("TurnedBearingEncoder", 5)])
 def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p):
     car = ("env=dubins", f"network.encoder={encoder}", f"network.latent_dim={p}", "network.remember_action=true", "synthesis.gain=0.3",
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
