@@ -1,11 +1,13 @@
-"""Mutants of the comparison's trials: what they share, and what they are worth."""
+"""Mutants of the comparison: what trials share and are worth, and how many transitions this library's own row takes."""
 
 from __future__ import annotations
 
 BASE, TUNING = "torchrl_sspl/baselines/base.py", "torchrl_sspl/baselines/tuning.py"
 LATENT, VISION = "torchrl_sspl/baselines/latent_cbf.py", "torchrl_sspl/baselines/vision_cbf.py"
 
-TRIED = "tests/baselines/test_tuning.py"
+SYNTHESIS, OWN = "torchrl_sspl/trainers/synthesis.py", "torchrl_sspl/baselines/sspl.py"
+
+TRIED, LEARNT = "tests/baselines/test_tuning.py", "tests/baselines/test_rivals.py"
 
 MUTANTS = [
     (BASE, "        torch.set_rng_state(state)\n", "", TRIED),
@@ -14,4 +16,7 @@ MUTANTS = [
     (VISION, '("steps", "batch", "adversarial", "plain")', '("steps", "batch", "plain")', TRIED),
     (TUNING, "LOST = 10.0", "LOST = 0.1", TRIED),
     (TUNING, 'key=lambda k: (found[k]["merit"], -k)', 'key=lambda k: (found[k]["merit"], k)', TRIED),
+    (SYNTHESIS, "range(s.near_draws)", "range(10)", LEARNT),
+    (OWN, '"synthesis.near_draws=1", ', "", LEARNT),
+    (OWN, "- rollouts) // s.rim_draws", "- rollouts)", LEARNT),
 ]
