@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from tiny import TINY_PHASES
 
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
@@ -15,9 +16,7 @@ from torchrl_sspl.errors import ConfigError
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "few_labels.py"
 SIZES = ["score.episodes=4", "score.horizon=3", "score.grid=11", "score.kernel_grid=31", "score.frames=1", "score.shifted=0"]
 SHORT = [
-    "network.barrier_hidden=[8,8]", "network.dynamics_hidden=[8]", "network.policy_hidden=[8]", "synthesis.residuals=2", "synthesis.actions=3",
-    "trainer.optim_steps_per_batch=4", "synthesis.dynamics_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=2", "synthesis.tune_steps=4",
-    "synthesis.tighten_steps=0", "synthesis.check_episodes=20", "synthesis.check_horizon=3", "synthesis.batch=32",
+    *TINY_PHASES, "trainer.optim_steps_per_batch=4", "synthesis.tighten_steps=0", "synthesis.check_episodes=20", "synthesis.check_horizon=3",
     "trainer.checkpoint_seconds=-1", "evaluation.certificate_seconds=0.1",
 ]  # fmt: skip
 

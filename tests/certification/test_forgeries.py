@@ -250,7 +250,10 @@ def test_events_of_the_true_system_are_counted_again(name, issued, tmp_path):
     assert (code, "RECORD_CHANGED" in text) == (Exit.REFUSED, True), text
 
 
-@pytest.mark.parametrize(("name", "chosen"), [(name, k % 2) for k, name in enumerate(BROKEN)])
+@pytest.mark.parametrize(
+    ("name", "chosen"),
+    [pytest.param(name, c, marks=pytest.mark.slow if c != k % 2 else ()) for k, name in enumerate(BROKEN) for c in (0, 1)],
+)
 def test_one_lowered_count_is_found_where_its_block_is_measured(name, chosen, tmp_path):
     law, lowered = BROKEN[name]
     agent, env = line_agent(), Line(law=law)

@@ -49,7 +49,7 @@ class Budget:
         return self.transitions + self.safe + self.unsafe + self.rollouts
 
 
-#: Small: one recording. Full: what this library's own training takes. Tiny: for tests.
+#: Small: one recording. Full: more than the shipped agents took, with rollouts. Tiny: for tests.
 BUDGETS = {
     "tiny": Budget("tiny", 96, 32, 32),
     "small": Budget("small", 16_000, 3_000, 4_000),

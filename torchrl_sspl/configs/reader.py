@@ -153,7 +153,7 @@ def _set(node: Any, key: str, given: Any, kind: Any) -> None:
 
 @cache
 def _cell(kind: Any) -> Any:
-    """Class with one value of a kind, of which there are few and many values."""
+    """Class that holds one value of a kind, made once: there are few kinds and many values."""
     return dataclasses.make_dataclass("Cell", [("value", kind)])
 
 
