@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
 
-.PHONY: pendulum quadruped demo table test docs wheel release-check clean
+.PHONY: pendulum quadruped demo table test types suite docs wheel release-check clean
 
 pendulum: $(VENV)/.viz
 	$(BIN)/python examples/inverted_pendulum.py $(ARGS)
@@ -22,8 +22,13 @@ table: $(VENV)/.viz $(VENV)/.quadruped
 
 test: $(VENV)/.test
 	$(BIN)/ruff check .
+	$(MAKE) --no-print-directory --jobs=2 types suite
+
+types: $(VENV)/.test
 	$(BIN)/mypy
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m "not slow and not gpu and not ray"
+
+suite: $(VENV)/.test
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist worksteal -m "not slow and not gpu and not ray"
 
 docs: $(VENV)/.docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict

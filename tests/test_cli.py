@@ -20,7 +20,7 @@ from torchrl_sspl.configs.reader import ENVS, fields, from_dict
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 #: A run of a few seconds, on top of preset=smoke.
 TINY = [
-    "preset=smoke", "trainer.progress=false", "env.image_size=16", "network.pool_to=8", "network.barrier_hidden=[8]",
+    "preset=smoke", "trainer.progress=false", "trainer.checkpoint_seconds=-1", "env.image_size=16", "network.pool_to=8", "network.barrier_hidden=[8]",
     "network.policy_hidden=[8]", "network.dynamics_hidden=[8]", "collector.frames_per_batch=64", "collector.init_random_frames=64",
     "trainer.total_frames=128", "trainer.optim_steps_per_batch=3", "buffer.batch=16", "synthesis.rounds=1", "synthesis.transitions=128",
     "synthesis.dynamics_steps=4", "synthesis.fit_steps=4", "synthesis.steer_steps=3", "synthesis.tune_steps=3", "synthesis.teach_steps=4",

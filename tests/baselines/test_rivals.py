@@ -266,7 +266,7 @@ def taken_at_most(config) -> tuple[int, int]:
 @pytest.mark.parametrize("draws", [1, 3])
 def test_a_training_whose_rollouts_all_end_far_from_the_set_takes_what_is_asked_for(draws, tmp_path, monkeypatch):
     monkeypatch.setattr("torchrl_sspl.trainers.synthesis._NEAR", -math.inf)
-    run = Experiment(compose([*TINY_RUN, "trainer.checkpoint_seconds=-1", f"synthesis.near_draws={draws}", f"out_dir={tmp_path}"]))
+    run = Experiment(compose([*TINY_RUN, f"synthesis.near_draws={draws}", f"out_dir={tmp_path}"]))
     run.train()
     assert run.work.source.budget["transitions"] == taken_at_most(run.config)[0]
 

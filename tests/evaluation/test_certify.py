@@ -17,7 +17,7 @@ from analytic import SIDE, Line, line_agent
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import Budget
-from torchrl_sspl.certification.certificate import Certificate, Reason
+from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, weights_digest
 from torchrl_sspl.certification.record import Counts
 from torchrl_sspl.certification.statistics import fingerprint
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
@@ -31,6 +31,23 @@ from torchrl_sspl.sets import Box
 
 STEPS = 6
 SHORT = Budget(boxes=50)  # where no proof is asked for
+
+
+PROVED: dict[tuple[Any, ...], Layer] = {}
+
+
+@pytest.fixture
+def proved_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is asked twice about the same weights is proved once: here one looks at what is measured."""
+    prove = certify_module._proof
+
+    def once(agent: Agent, *asked: Any) -> Layer:
+        key = weights_digest(agent.state_dict()), *asked
+        if key not in PROVED:
+            PROVED[key] = prove(agent, *asked)
+        return PROVED[key]
+
+    monkeypatch.setattr(certify_module, "_proof", once)
 
 
 def total(certificate: Certificate) -> Counts:
@@ -89,6 +106,7 @@ LOOPS: dict[str, tuple[Callable[[float], float], Callable[[float], float], float
 }
 
 
+@pytest.mark.usefixtures("proved_once")
 @pytest.mark.parametrize("name", LOOPS)
 def test_events_are_those_of_every_single_step(name, monkeypatch):
     law, shown, gain, expected = LOOPS[name]
@@ -116,6 +134,7 @@ def test_events_are_those_of_every_single_step(name, monkeypatch):
         assert layer["episodes"].reason == ("UNSAFE_ENTERED" if "entered" in expected else "EPISODES_LEAVE")
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_a_system_in_which_every_episode_enters_u_and_stays_is_refused():
     # Nobody leaves {B <= 0} by what the pictures show.
     env = Line(law=lambda x: torch.full_like(x, 0.9), shown=lambda x: torch.where(x.abs() > 0.8, 0.1, x))
@@ -126,6 +145,7 @@ def test_a_system_in_which_every_episode_enters_u_and_stays_is_refused():
     assert Reason.UNSAFE_ENTERED in certificate.layers["statistical"].reasons
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_half_of_the_observations_of_u_are_where_it_is_entered():
     # x+ = clamp(x + 0.6 v): 4 in 9 of those that enter U come to its very end, of a uniform sample 1 in 200.
     # Only there it looks safe.
@@ -147,6 +167,7 @@ class Blind(nn.Module):
         return torch.where(z[..., :1] > self.above, torch.nan, z)
 
 
+@pytest.mark.usefixtures("proved_once")
 @pytest.mark.parametrize(("known", "horizon"), [(True, 3), (True, 1), (False, 3)])  # after one step no policy is asked
 def test_no_number_is_an_event_and_no_way_to_stay_inside(known, horizon):
     agent = line_agent()
@@ -175,6 +196,7 @@ class Stuck(Line):
         return torch.full((n, 1), 0.25)
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_copies_of_one_episode_are_not_independent():
     certificate = certify_on_episodes(line_agent(), Stuck, episodes=100, horizon=3, envs=10)
     record, layer = certificate.record, certificate.layers["statistical"]
@@ -192,11 +214,13 @@ class StuckOften(Line):
         return torch.where(torch.arange(n)[:, None] % 4 == 0, 0.25, state)
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_a_quarter_of_copies_is_refused():
     certificate = certify_on_episodes(line_agent(), StuckOften, episodes=80, horizon=3, envs=8)
     assert Reason.CALIBRATION_REUSED in certificate.layers["statistical"].reasons
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_states_on_a_line_do_not_collide_falsely():
     for seed in (0, 1):
         certificate = certify(line_agent(), Line(), episodes=1000, horizon=1, seed=seed)
@@ -206,6 +230,7 @@ def test_states_on_a_line_do_not_collide_falsely():
         assert certificate.layers["statistical"]["episodes"].n == 1000 - record.sizes["repeated"]
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_episodes_end_where_the_environment_ends_them():
     make = partial(Line, initial=0.9, horizon=2)
     record = certify_on_episodes(line_agent(), make, episodes=40, horizon=9, envs=8).record
@@ -215,6 +240,7 @@ def test_episodes_end_where_the_environment_ends_them():
     assert record.total.episodes < 0.75 * len(record.blocks) * record.block  # five in nine begin in the set
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_blocks_of_resets_are_different_episodes():
     record = certify_on_episodes(line_agent(), partial(Line, initial=0.4), episodes=250, horizon=1, envs=50).record
     assert record is not None
@@ -223,6 +249,7 @@ def test_blocks_of_resets_are_different_episodes():
     assert record.sizes["repeated"] <= 4
 
 
+@pytest.mark.usefixtures("proved_once")
 def test_resets_show_what_the_camera_hides():
     make = partial(Line, shown=lambda x: torch.where(x.abs() > 0.8, 0.1, x))
     certificate = certify_on_episodes(line_agent(), make, episodes=60, horizon=2, envs=20)

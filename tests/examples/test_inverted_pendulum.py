@@ -6,7 +6,7 @@ import json
 import shutil
 
 import pytest
-from tiny import TINY
+from tiny import SAVED, TINY
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:init_random_frames")
 EXAMPLE = "inverted_pendulum.py"
@@ -17,7 +17,7 @@ SMALL = ["evaluation.grid=9", "evaluation.kernel_grid=61", "evaluation.episodes=
 @pytest.fixture(scope="module")
 def trained(program, tmp_path_factory):
     directory = tmp_path_factory.mktemp("pendulum")
-    return program(EXAMPLE, *WORDS, *SMALL, f"out_dir={directory}"), directory
+    return program(EXAMPLE, *WORDS, SAVED, *SMALL, f"out_dir={directory}"), directory
 
 
 def test_a_run_writes_numbers_figures_report_and_agent(trained):
@@ -55,7 +55,7 @@ def test_every_phase_of_both_rounds_was_run(trained):
 def test_started_again_it_is_not_trained_again(program, trained, tmp_path, capsys):
     directory = shutil.copytree(trained[1], tmp_path / "again")
     weights, log = (directory / "agent" / "agent.safetensors").read_bytes(), (directory / "log.jsonl").read_bytes()
-    assert program(EXAMPLE, *WORDS, *SMALL, "evaluation.renderer_episodes=0", f"out_dir={directory}") == 0
+    assert program(EXAMPLE, *WORDS, SAVED, *SMALL, "evaluation.renderer_episodes=0", f"out_dir={directory}") == 0
     assert (directory / "agent" / "agent.safetensors").read_bytes() == weights
     assert (directory / "log.jsonl").read_bytes() == log
     assert "missed" in capsys.readouterr().out

@@ -13,7 +13,7 @@ import pytest
 import torch
 from conformance.cases import CASES, Case
 from tensordict import TensorDict
-from tiny import TINY, TINY_PHASES
+from tiny import SAVED, SINGLE, TINY, TINY_PHASES
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
@@ -228,7 +228,7 @@ def test_all_phases_learn_from_pixels_on_the_gpu(words, phases, tmp_path):
 
 
 def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(deterministic, tmp_path):
-    words = [*TINY, "synthesis.rounds=1", "trainer.checkpoint_seconds=3600", "device=cuda"]
+    words = [*SINGLE, SAVED, "device=cuda"]
     whole = Experiment(compose([*words, f"out_dir={tmp_path / 'whole'}"])).train()
     broken = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"]))
     save = broken.trainer.save_trainer

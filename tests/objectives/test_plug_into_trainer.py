@@ -29,7 +29,8 @@ def example():
 
 
 def test_a_loop_of_ones_own_separates_safe_from_unsafe(example) -> None:
-    result = example.main(*SMALL, batches=6, updates=50, loop=True, phases=False)
+    # Two sets are told apart by their pictures; no episode has to be watched for long.
+    result = example.main(*SMALL, "evaluation.episodes=10", "evaluation.horizon=2", batches=6, updates=50, loop=True, phases=False)
     assert result["safe_called_unsafe"] <= 0.05
     assert result["unsafe_called_safe"] <= 0.05
     assert set(result) == set(example.SHOWN)

@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from tiny import TINY
+from tiny import SAVED, TINY
 
 import torchrl_sspl as sspl
 from torchrl_sspl.configs.schema import EvaluationConfig
@@ -108,7 +108,7 @@ def ends(running: Callable[[], list[int]], patience: float = 60.0, least: float 
     return True
 
 
-ENDS = ["never begun", "an exception"] + [pytest.param(end, marks=pytest.mark.slow) for end in ("Control-C", "the end", "killed")]
+ENDS = ["an exception"] + [pytest.param(end, marks=pytest.mark.slow) for end in ("never begun", "Control-C", "the end", "killed")]
 
 
 @pytest.mark.parametrize("end", ENDS)
@@ -117,7 +117,7 @@ def test_collector_processes_and_temporary_files_are_gone_with_the_run(tmp_path,
     mark, folder, script = uuid.uuid4().hex, tmp_path / "temporary".ljust(80, "-"), tmp_path / "run.py"
     folder.mkdir()
     script.write_text(RUN)
-    words = [*TINY, "collector.backend=process", "collector.workers=2", "synthesis.enabled=false", f"out_dir={tmp_path / 'run'}"]
+    words = [*TINY, SAVED, "collector.backend=process", "collector.workers=2", "synthesis.enabled=false", f"out_dir={tmp_path / 'run'}"]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "MARK": mark, "TMPDIR": str(folder)}
     environment["TORCHINDUCTOR_CACHE_DIR"] = str(tmp_path / "kept")  # which is to stay
     # What it prints goes to a file: with a pipe one would wait for whoever has it still open.

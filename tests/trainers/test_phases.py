@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from tensordict import TensorDict
-from tiny import TINY
+from tiny import SAVED, TINY
 from torch import nn
 
 import torchrl_sspl.journal as journal_module
@@ -44,7 +44,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::Deprec
 
 
 def experiment(path: Path, *overrides: str) -> Experiment:
-    return Experiment(compose([*TINY, *overrides, f"out_dir={path}"]))
+    return Experiment(compose([*TINY, SAVED, *overrides, f"out_dir={path}"]))
 
 
 class Killed(Exception):
@@ -72,7 +72,7 @@ def assert_same(one: nn.Module, other: nn.Module) -> None:
         assert torch.equal(value, expected[name]), name
 
 
-EVERY_STEP = "trainer.checkpoint_seconds=0"
+EVERY_STEP, UNSAVED = "trainer.checkpoint_seconds=0", "trainer.checkpoint_seconds=-1"
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def uninterrupted(tmp_path_factory):
     return found, found.train()
 
 
-@pytest.mark.parametrize("checkpoints", [4, 21, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3, 8, 13, 27)]])
+@pytest.mark.parametrize("checkpoints", [21, *[pytest.param(k, marks=pytest.mark.slow) for k in (1, 2, 3, 4, 8, 13, 27)]])
 def test_a_killed_training_continues_bit_for_bit(tmp_path, uninterrupted, checkpoints):
     whole, expected = uninterrupted
     killed_after(experiment(tmp_path, EVERY_STEP), checkpoints)
@@ -168,16 +168,18 @@ def test_what_was_logged_after_the_last_checkpoint_is_not_logged_twice(tmp_path,
     assert log.read_text() == (uninterrupted[0].directory / "log.jsonl").read_text()
 
 
+@pytest.mark.slow  # as is the one of the grid below
 def test_a_policy_that_is_taught_first_continues_bit_for_bit_too(tmp_path):
     value = "synthesis.teacher=value"
-    expected = experiment(tmp_path / "whole", value).train()
+    expected = experiment(tmp_path / "whole", value, UNSAVED).train()
     killed_after(experiment(tmp_path / "killed", value, EVERY_STEP), 14)
     assert_same(experiment(tmp_path / "killed", value).train(), expected)
 
 
+@pytest.mark.slow
 def test_a_policy_that_chooses_continues_bit_for_bit_too(tmp_path):
     chooses = ("synthesis.choices=3", "synthesis.gain=0.5", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4")
-    expected = experiment(tmp_path / "whole", *chooses).train()
+    expected = experiment(tmp_path / "whole", *chooses, UNSAVED).train()
     assert isinstance(expected.policy, ChoosingPolicy)
     assert expected.policy.actions.flatten().tolist() == [-10.0, 0.0, 10.0]
     killed_after(experiment(tmp_path / "killed", *chooses, EVERY_STEP), 14)
@@ -290,7 +292,7 @@ def test_targets_on_a_grid_are_settled_in_place_of_a_fine_tuning():
 def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p):
     car = ("env=dubins", f"network.encoder={encoder}", f"network.latent_dim={p}", "network.remember_action=true", "synthesis.gain=0.3",
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
-    expected = experiment(tmp_path / "whole", *car).train()
+    expected = experiment(tmp_path / "whole", *car, UNSAVED).train()
     killed_after(experiment(tmp_path / "killed", *car, EVERY_STEP), 14)
     assert_same(experiment(tmp_path / "killed", *car).train(), expected)
 
@@ -299,7 +301,7 @@ def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p
 def test_a_grid_of_latents_that_a_picture_shows_whole_trains(tmp_path, encoder):
     car = ("env=cmu", "env.image_size=32", f"network.encoder={encoder}", "network.latent_dim=2", "network.remember_action=false",
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
-    found = experiment(tmp_path, *car)
+    found = experiment(tmp_path, *car, UNSAVED)
     assert found.train().latent_dim == 2
     assert found.work.seen_dim is None
 
@@ -320,7 +322,7 @@ def test_inside_the_phases_checkpoints_hold_no_pictures(tmp_path):
 
 
 def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
-    other = experiment(tmp_path, "seed=1").train()
+    other = experiment(tmp_path, "seed=1", UNSAVED).train()
     with pytest.raises(AssertionError):
         assert_same(other, uninterrupted[1])
 
@@ -404,7 +406,7 @@ def test_retries_resume_exactly_and_end_when_one_passes(tmp_path, monkeypatch):
     monkeypatch.setattr(CheckRound, "_held_out", lambda self, work, agent: object())
     monkeypatch.setattr(CheckRound, "_check", found)
     words = ["synthesis.rounds=1", "synthesis.retries=3", "synthesis.cover_share=0"]
-    whole = experiment(tmp_path / "whole", *words)
+    whole = experiment(tmp_path / "whole", *words, UNSAVED)
     agent = whole.train()
     assert [c.round for c in whole.work.checks] == [0, 1, 2]  # the third retry is not needed
     assert whole.work.best["round"] == 2
@@ -443,7 +445,7 @@ def _networks():
 def test_changes_of_the_action_are_a_term_of_the_fine_tuning_where_they_are_asked_for(tmp_path):
     for coefficient, logged in ((0.0, False), (0.5, True)):
         folder = tmp_path / str(coefficient)
-        experiment(folder, "synthesis.rounds=1", f"synthesis.change_coeff={coefficient}").train()
+        experiment(folder, "synthesis.rounds=1", f"synthesis.change_coeff={coefficient}", UNSAVED).train()
         rows = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
         tuned = [row for row in rows if row["phase"] == "tune"]
         assert tuned
@@ -458,7 +460,7 @@ class Count(Phase):
 
 
 def test_phases_can_be_left_out_and_added_to(tmp_path):
-    found = experiment(tmp_path)
+    found = experiment(tmp_path, UNSAVED)
     found.train()
     config = compose([*TINY, "synthesis.rounds=1"]).synthesis
     counted = Count()
@@ -475,7 +477,7 @@ def test_phases_can_be_left_out_and_added_to(tmp_path):
 
 
 def test_where_U_is_never_seen_nothing_is_synthesised(tmp_path, monkeypatch):
-    found = experiment(tmp_path, "synthesis.rounds=1")
+    found = experiment(tmp_path, "synthesis.rounds=1", UNSAVED)
     monkeypatch.setattr(type(found.work), "unsafe", lambda self: torch.zeros(len(self.latents["latent"]), dtype=torch.bool))
     found.train()
     assert any("what follows needs both kinds" in text for text in found.work.warnings)

@@ -57,9 +57,11 @@ def write_run_report(outcome: Outcome, env: SafetyEnv | None, *, title: str | No
     """
     folder = Path(outcome.directory) / "figures"
     folder.mkdir(parents=True, exist_ok=True)
-    figures = draw_figures(outcome, env)
+    figures, shown = draw_figures(outcome, env), {}
     for name, figure in figures.items():
-        figure.savefig(folder / f"{name.lower().replace(' ', '_')}.png", dpi=130)
+        path = folder / f"{name.lower().replace(' ', '_')}.png"
+        figure.savefig(path, dpi=160)  # the page shows the file: a figure is drawn once
+        shown[name] = path, str(figure.get_label() or "")
     film, caption = _film(outcome, env, folder)
     requirements = () if env is None else env.system.requirements
     rows: list[Any] = []
@@ -78,7 +80,7 @@ def write_run_report(outcome: Outcome, env: SafetyEnv | None, *, title: str | No
         title=title or ("Safe policy from pixels" if env is None else env.system.title),
         summary=rows,
         measurements=measurements,
-        figures=figures,
+        figures=shown,
         config=config,
         checks=outcome.checks,
         video=film,
