@@ -168,7 +168,7 @@ def test_what_was_logged_after_the_last_checkpoint_is_not_logged_twice(tmp_path,
     assert log.read_text() == (uninterrupted[0].directory / "log.jsonl").read_text()
 
 
-@pytest.mark.slow  # as is the one of the grid below
+@pytest.mark.slow  # on the grid below a policy is taught first, too, and chooses
 def test_a_policy_that_is_taught_first_continues_bit_for_bit_too(tmp_path):
     value = "synthesis.teacher=value"
     expected = experiment(tmp_path / "whole", value, UNSAVED).train()
