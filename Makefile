@@ -2,7 +2,8 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt
+# Python compiles what is imported when it is imported: to compile all of it takes longer than the rest of the installation.
+PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 .PHONY: pendulum quadruped demo table test types suite docs wheel release-check clean
 

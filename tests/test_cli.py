@@ -295,7 +295,7 @@ def test_gymnasium_and_an_encoder_by_import_paths(tmp_path, capsys, monkeypatch)
 def test_calibrate_writes_limits_that_the_monitor_reads(tmp_path, capsys):
     agent = torchrl_sspl.load("pendulum")
     agent.save(tmp_path / "run")
-    assert cli.main(["calibrate", str(tmp_path / "run"), "--episodes", "4", "--horizon", "3", "--pictures", "200"]) == 0
+    assert cli.main(["calibrate", str(tmp_path / "run"), "--episodes", "4", "--horizon", "3", "--pictures", "200", "--steps", "50"]) == 0
     shown = capsys.readouterr().out
     assert "innovation" in shown
     assert "100 % expected" in shown  # of four episodes

@@ -34,7 +34,11 @@ def load(name: str) -> ModuleType:
         raise
 
 
-@pytest.mark.parametrize("name", ["torchrl_sspl", *NAMES])
+# Those that prove a shipped agent's set again.
+SLOW = "torchrl_sspl.evaluation.certify"
+
+
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == SLOW else n for n in ("torchrl_sspl", *NAMES)])
 def test_examples_in_docstrings_run(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)  # what an example writes does not stay
     module = load(name)

@@ -287,6 +287,7 @@ def _calibrate(words: list[str]) -> int:
     parser.add_argument("--episodes", type=int, default=1000, help="episodes for the limits; the more, the fewer false alarms (default: 1000)")
     parser.add_argument("--horizon", type=int, default=200, help="steps per episode (default: 200)")
     parser.add_argument("--pictures", type=int, default=20_000, help="pictures for the model of clean pictures (default: 20000)")
+    parser.add_argument("--steps", type=int, default=3000, help="steps of the model's fit (default: 3000)")
     parser.add_argument("--noise", type=float, default=1.0, help="noise of the camera, grey levels (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="random seed")
     given = parser.parse_args(words)
@@ -294,10 +295,10 @@ def _calibrate(words: list[str]) -> int:
     from torchrl_sspl.modules.agent import Agent, agent_directory
     from torchrl_sspl.runtime import calibrate
 
-    if min(given.episodes, given.horizon, given.pictures) < 1 or not given.noise >= 0.0:
+    if min(given.episodes, given.horizon, given.pictures, given.steps) < 1 or not given.noise >= 0.0:
         raise ConfigError(
-            f"expected episodes, horizon and pictures >= 1 and noise >= 0, received {given.episodes}, {given.horizon}, {given.pictures} "
-            f"and {given.noise}"
+            f"expected episodes, horizon, pictures and steps >= 1 and noise >= 0, received {given.episodes}, {given.horizon}, "
+            f"{given.pictures}, {given.steps} and {given.noise}"
         )
     directory = agent_directory(given.agent)
     if given.out is None and directory.resolve().is_relative_to(Path(__file__).resolve().parent):
@@ -308,8 +309,8 @@ def _calibrate(words: list[str]) -> int:
     if not hasattr(env, "previous_state"):
         raise ConfigError("expected an agent whose system's states are known, received another one; call calibrate(agent, env) on yours")
     found = calibrate(
-        agent, env, episodes=given.episodes, horizon=given.horizon, pictures=given.pictures, noise=given.noise, seed=given.seed,
-        progress=sys.stderr.isatty(),
+        agent, env, episodes=given.episodes, horizon=given.horizon, pictures=given.pictures, steps=given.steps, noise=given.noise,
+        seed=given.seed, progress=sys.stderr.isatty(),
     )  # fmt: skip
     for name, (low, high) in found.limits.items():
         print(f"{name:<12} {low:.4g} to {high:.4g}")

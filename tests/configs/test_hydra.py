@@ -31,7 +31,7 @@ def by_hydra():
 
 
 @pytest.mark.parametrize("env", [None, *ENVS])
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", [PRESETS[0], *(pytest.param(preset, marks=pytest.mark.slow) for preset in PRESETS[1:])])
 def test_the_same_words_give_the_same_configuration(by_hydra, env, preset):
     words = [*([f"env={env}"] if env else []), f"preset={preset}", "seed=3", "network.policy_hidden=[8,8]", "logger=wandb"]
     assert by_hydra(*words) == compose(words)

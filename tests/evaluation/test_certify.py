@@ -329,10 +329,14 @@ POOL: dict[str, dict[str, Any]] = {
 }
 
 
+FAST = (
+    "as it is", "one episode", "another level", "a level that is not kept", "an empty set", "more seeds", "no time", "nothing measured",
+    "a system that enters U", "a camera that lies",
+)  # fmt: skip
 WITH_PROOF = ("as it is", "another level", "a level that is not kept", "an empty set", "nothing measured")
 
 
-@pytest.mark.parametrize("name", POOL)
+@pytest.mark.parametrize("name", [name if name in FAST else pytest.param(name, marks=pytest.mark.slow) for name in POOL])
 def test_an_honest_certificate_is_found_again(name, tmp_path):
     # Where the proof is another one it takes its time; where only what is measured changes it ends early.
     few = {} if name in WITH_PROOF else {"budget": SHORT}
@@ -350,13 +354,13 @@ def test_an_honest_certificate_is_found_again(name, tmp_path):
     "options",
     [
         {},
-        {"initial": 0.3},
+        pytest.param({"initial": 0.3}, marks=pytest.mark.slow),
         {"initial": 0.9, "horizon": 2},
         {"law": lambda x: torch.where(x > 0.2, 0.9, x)},
-        {"seed": 5},
+        pytest.param({"seed": 5}, marks=pytest.mark.slow),
         {"envs": 7},
-        {"confidence": 0.8, "acceptable": 0.3},
-        {"budget": Budget(seconds=0.0)},
+        pytest.param({"confidence": 0.8, "acceptable": 0.3}, marks=pytest.mark.slow),
+        pytest.param({"budget": Budget(seconds=0.0)}, marks=pytest.mark.slow),
     ],
 )
 def test_an_honest_certificate_of_resets_is_found_again(options, tmp_path):

@@ -8,6 +8,8 @@ import shutil
 import pytest
 from tiny import SAVED, TINY
 
+from torchrl_sspl.envs import PendulumRenderer
+
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning", "ignore:init_random_frames")
 EXAMPLE = "inverted_pendulum.py"
 WORDS = [w for w in TINY if w != "env=pendulum"]
@@ -17,7 +19,10 @@ SMALL = ["evaluation.grid=9", "evaluation.kernel_grid=61", "evaluation.episodes=
 @pytest.fixture(scope="module")
 def trained(program, tmp_path_factory):
     directory = tmp_path_factory.mktemp("pendulum")
-    return program(EXAMPLE, *WORDS, SAVED, *SMALL, f"out_dir={directory}"), directory
+    with pytest.MonkeyPatch.context() as quick:
+        # The same pictures in closed form: gymnasium takes 3 ms for each, test_rendering.py holds them to each other.
+        quick.setattr("torchrl_sspl.envs.pendulum._gymnasium_renderer", PendulumRenderer)
+        return program(EXAMPLE, *WORDS, SAVED, *SMALL, f"out_dir={directory}"), directory
 
 
 def test_a_run_writes_numbers_figures_report_and_agent(trained):

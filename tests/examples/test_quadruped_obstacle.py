@@ -61,6 +61,7 @@ def test_the_command_measures_it_on_the_car_that_turns_at_once(trained):
     assert found.measurements["unsafe_called_safe"].n == 5 * 5 * 3
 
 
+@pytest.mark.slow  # walks and films of the shipped agent have tests of their own
 def test_a_trained_agent_walks_and_none_is_trained(program, trained, tmp_path):
     pytest.importorskip("pybullet", reason="needs the extra quadruped")
     _, directory = trained

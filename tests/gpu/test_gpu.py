@@ -229,7 +229,7 @@ def test_all_phases_learn_from_pixels_on_the_gpu(words, phases, tmp_path):
 
 def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(deterministic, tmp_path):
     words = [*SINGLE, SAVED, "device=cuda"]
-    whole = Experiment(compose([*words, f"out_dir={tmp_path / 'whole'}"])).train()
+    whole = Experiment(compose([*SINGLE, "device=cuda", f"out_dir={tmp_path / 'whole'}"])).train()
     broken = Experiment(compose([*words, f"out_dir={tmp_path / 'broken'}"]))
     save = broken.trainer.save_trainer
 
@@ -237,7 +237,6 @@ def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(determin
         if broken.work.where["phase"] == "steer":
             save(force_save=True)
             raise InterruptedError
-        save(force_save)
 
     broken.trainer.save_trainer = stop_in_steer
     with pytest.raises(InterruptedError):
@@ -309,7 +308,7 @@ def test_quadrupeds_agent_answers_from_the_gpu():
 
 
 def test_certificates_say_the_same_of_an_agent_on_the_gpu(pair):
-    short = {"level": 0.0, "horizon": 5, "budget": Budget(boxes=2_000)}
+    short = {"level": 0.0, "horizon": 5, "budget": Budget(boxes=200)}
     here, there = (certify(agent, PendulumEnv(batch_size=[1]), episodes=20, **short) for agent in pair)
     resets = certify_on_episodes(pair[1], PendulumEnv, episodes=20, envs=10, **short)
     assert here.weights == there.weights == resets.weights
@@ -360,4 +359,4 @@ def test_the_monitor_and_the_filter_run_where_the_agent_is():
     made = Shield(there)(theirs.latent, torch.full((2, 1), 10.0, device="cuda"))
     monitors[1].took(made.action)
     monitors[1].reset(torch.tensor([1]))
-    assert calibrate(there, env, episodes=2, horizon=2, pictures=100).weights == monitors[1].calibration.weights
+    assert calibrate(there, env, episodes=2, horizon=2, pictures=100, steps=20).weights == monitors[1].calibration.weights

@@ -254,7 +254,7 @@ def test_a_calibration_belongs_to_one_agent_and_is_replaced_in_one_step(tmp_path
 
 def test_a_calibration_calls_its_own_episodes_clean_and_a_fault_strange():
     agent, env = load("pendulum"), PendulumEnv(batch_size=[1], seed=0)
-    found = calibrate(agent, env, episodes=24, horizon=10, pictures=2000)
+    found = calibrate(agent, env, episodes=24, horizon=10, pictures=2000, steps=600)
     assert found.false_alarms == pytest.approx(7 / 25)
     start = starts(agent, env, 24, torch.Generator().manual_seed(9))
     alarms = {}

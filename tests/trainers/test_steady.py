@@ -6,7 +6,7 @@ import copy
 
 import pytest
 import torch
-from test_phases import EVERY_STEP, UNSAVED, assert_same, experiment, killed_after
+from test_phases import EVERY_STEP, UNSAVED, assert_same, experiment, killed_after, resumed
 
 from torchrl_sspl import journal
 from torchrl_sspl.configs import compose
@@ -158,6 +158,5 @@ def test_it_resumes_bit_for_bit_with_the_pictures_that_are_needed(tmp_path, unin
     killed = experiment(tmp_path, *STEADY, EVERY_STEP)
     killed_after(killed, checkpoints)
     assert killed.work.where["phase"] == phase
-    resumed = experiment(tmp_path, *STEADY)
-    assert_same(resumed.train(), expected)
+    assert_same(resumed(tmp_path, *STEADY).train(), expected)
     assert (tmp_path / "log.jsonl").read_text() == (whole.directory / "log.jsonl").read_text()

@@ -420,6 +420,7 @@ def calibrate(
     horizon: int = 200,
     noise: float = 1.0,
     pictures: int = 20_000,
+    steps: int = 3000,
     seed: int = 0,
     progress: bool = False,
 ) -> Calibration:
@@ -436,6 +437,7 @@ def calibrate(
         horizon: steps of each.
         noise: standard deviation of the camera's noise, grey levels, added to every frame.
         pictures: for the model.
+        steps: of its fit.
         seed: root of everything drawn.
         progress: show progress bars.
 
@@ -451,7 +453,7 @@ def calibrate(
         now, before = env.draw(part), env.draw(env.previous_state(part))
         latents.append(agent.encode(torch.cat([before, now], 1)))
         shown.append(small(now.float() / 255.0))
-    model.fit(torch.cat(latents), torch.cat(shown), seed=spawn(seed, "monitor", 2), progress=progress)
+    model.fit(torch.cat(latents), torch.cat(shown), steps=steps, seed=spawn(seed, "monitor", 2), progress=progress)
     wide = {name: (-math.inf, math.inf) for name in SIGNALS}
     calibration = Calibration(model, wide, episodes, horizon, weights_digest(agent.state_dict()))
     start = starts(agent, env, episodes, g)
