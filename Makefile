@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-# Python compiles what is imported when it is imported: to compile all of it takes longer than the rest of the installation.
+# Python compiles what is imported when it is imported: to compile all of it takes about as long as the rest of the installation.
 PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
 
 .PHONY: pendulum quadruped demo table test types suite docs wheel release-check clean
