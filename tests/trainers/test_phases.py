@@ -44,7 +44,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::Deprec
 
 
 def experiment(path: Path, *overrides: str) -> Experiment:
-    return Experiment(compose([*TINY, SAVED, *overrides, f"out_dir={path}"]))
+    return Experiment(compose([*TINY, *overrides, f"out_dir={path}"]))
 
 
 class Killed(Exception):
@@ -53,7 +53,7 @@ class Killed(Exception):
 
 def resumed(path: Path, *overrides: str) -> Experiment:
     """What goes on from the newest checkpoint, and, since nobody reads them, writes none."""
-    found = experiment(path, *overrides)
+    found = experiment(path, *overrides, SAVED)
     found.trainer._save_trainer = lambda: None  # type: ignore[method-assign]
     return found
 
@@ -79,12 +79,12 @@ def assert_same(one: nn.Module, other: nn.Module) -> None:
         assert torch.equal(value, expected[name]), name
 
 
-EVERY_STEP, UNSAVED = "trainer.checkpoint_seconds=0", "trainer.checkpoint_seconds=-1"
+EVERY_STEP = "trainer.checkpoint_seconds=0"
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    found = experiment(tmp_path_factory.mktemp("whole"))
+    found = experiment(tmp_path_factory.mktemp("whole"), SAVED)
     return found, found.train()
 
 
@@ -123,7 +123,7 @@ def test_what_a_phase_without_steps_had_found_is_not_found_again(tmp_path, unint
     with pytest.raises(Killed):
         experiment(tmp_path, EVERY_STEP).train()
     monkeypatch.setattr(Entry, "saved", counted)
-    again = experiment(tmp_path)
+    again = experiment(tmp_path, SAVED)
     assert_same(again.train(), expected)
     assert any(taken)
     assert again.work.checks == whole.work.checks
@@ -180,7 +180,7 @@ def test_what_was_logged_after_the_last_checkpoint_is_not_logged_twice(tmp_path,
 @pytest.mark.slow  # on the grid below a policy is taught first, too, and chooses
 def test_a_policy_that_is_taught_first_continues_bit_for_bit_too(tmp_path):
     value = "synthesis.teacher=value"
-    expected = experiment(tmp_path / "whole", value, UNSAVED).train()
+    expected = experiment(tmp_path / "whole", value).train()
     killed_after(experiment(tmp_path / "killed", value, EVERY_STEP), 14)
     assert_same(resumed(tmp_path / "killed", value).train(), expected)
 
@@ -188,7 +188,7 @@ def test_a_policy_that_is_taught_first_continues_bit_for_bit_too(tmp_path):
 @pytest.mark.slow
 def test_a_policy_that_chooses_continues_bit_for_bit_too(tmp_path):
     chooses = ("synthesis.choices=3", "synthesis.gain=0.5", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4")
-    expected = experiment(tmp_path / "whole", *chooses, UNSAVED).train()
+    expected = experiment(tmp_path / "whole", *chooses).train()
     assert isinstance(expected.policy, ChoosingPolicy)
     assert expected.policy.actions.flatten().tolist() == [-10.0, 0.0, 10.0]
     killed_after(experiment(tmp_path / "killed", *chooses, EVERY_STEP), 14)
@@ -301,7 +301,7 @@ def test_targets_on_a_grid_are_settled_in_place_of_a_fine_tuning():
 def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p):
     car = ("env=dubins", f"network.encoder={encoder}", f"network.latent_dim={p}", "network.remember_action=true", "synthesis.gain=0.3",
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
-    expected = experiment(tmp_path / "whole", *car, UNSAVED).train()
+    expected = experiment(tmp_path / "whole", *car).train()
     killed_after(experiment(tmp_path / "killed", *car, EVERY_STEP), 14)
     assert_same(resumed(tmp_path / "killed", *car).train(), expected)
 
@@ -310,7 +310,7 @@ def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p
 def test_a_grid_of_latents_that_a_picture_shows_whole_trains(tmp_path, encoder):
     car = ("env=cmu", "env.image_size=32", f"network.encoder={encoder}", "network.latent_dim=2", "network.remember_action=false",
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
-    found = experiment(tmp_path, *car, UNSAVED)
+    found = experiment(tmp_path, *car)
     assert found.train().latent_dim == 2
     assert found.work.seen_dim is None
 
@@ -331,7 +331,7 @@ def test_inside_the_phases_checkpoints_hold_no_pictures(tmp_path):
 
 
 def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
-    other = experiment(tmp_path, "seed=1", UNSAVED).train()
+    other = experiment(tmp_path, "seed=1").train()
     with pytest.raises(AssertionError):
         assert_same(other, uninterrupted[1])
 
@@ -339,8 +339,8 @@ def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
 def test_a_checkpoint_of_other_settings_is_refused(uninterrupted):
     path, margin = uninterrupted[0].directory, uninterrupted[0].config.synthesis.margin
     with pytest.raises(CheckpointError, match=rf"synthesis\.margin: {margin}, now 0\.07"):
-        experiment(path, "synthesis.margin=0.07").train()
-    assert experiment(path, "trainer.progress=false", "evaluation.seed=3").train() is not None  # these may change
+        experiment(path, "synthesis.margin=0.07", SAVED).train()
+    assert experiment(path, "trainer.progress=false", "evaluation.seed=3", SAVED).train() is not None  # these may change
 
 
 def test_an_unreadable_checkpoint_is_named(tmp_path):
@@ -349,7 +349,7 @@ def test_an_unreadable_checkpoint_is_named(tmp_path):
         if file.parent.parent.name == "components":
             file.write_text("{")
     with pytest.raises(CheckpointError, match="expected a checkpoint of this trainer"):
-        experiment(tmp_path).train()
+        experiment(tmp_path, SAVED).train()
 
 
 def test_the_written_agent_is_the_returned_one(uninterrupted):
@@ -415,14 +415,14 @@ def test_retries_resume_exactly_and_end_when_one_passes(tmp_path, monkeypatch):
     monkeypatch.setattr(CheckRound, "_held_out", lambda self, work, agent: object())
     monkeypatch.setattr(CheckRound, "_check", found)
     words = ["synthesis.rounds=1", "synthesis.retries=3", "synthesis.cover_share=0"]
-    whole = experiment(tmp_path / "whole", *words, UNSAVED)
+    whole = experiment(tmp_path / "whole", *words)
     agent = whole.train()
     assert [c.round for c in whole.work.checks] == [0, 1, 2]  # the third retry is not needed
     assert whole.work.best["round"] == 2
     rows = [json.loads(line) for line in (whole.directory / "log.jsonl").read_text().splitlines()]
     assert sum(row["phase"] == "dynamics" and row["round"] > 0 for row in rows) == 0
     tuned = next(k for k, p in enumerate(whole.phases.phases) if p.number == 2 and p.name == "tune")
-    broken = experiment(tmp_path / "broken", *words)
+    broken = experiment(tmp_path / "broken", *words, SAVED)
     save = broken.trainer.save_trainer
 
     def die_while_tuning(force_save: bool = False) -> None:
@@ -454,7 +454,7 @@ def _networks():
 def test_changes_of_the_action_are_a_term_of_the_fine_tuning_where_they_are_asked_for(tmp_path):
     for coefficient, logged in ((0.0, False), (0.5, True)):
         folder = tmp_path / str(coefficient)
-        experiment(folder, "synthesis.rounds=1", f"synthesis.change_coeff={coefficient}", UNSAVED).train()
+        experiment(folder, "synthesis.rounds=1", f"synthesis.change_coeff={coefficient}").train()
         rows = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
         tuned = [row for row in rows if row["phase"] == "tune"]
         assert tuned
@@ -469,7 +469,7 @@ class Count(Phase):
 
 
 def test_phases_can_be_left_out_and_added_to(tmp_path):
-    found = experiment(tmp_path, UNSAVED)
+    found = experiment(tmp_path)
     found.train()
     config = compose([*TINY, "synthesis.rounds=1"]).synthesis
     counted = Count()
@@ -486,7 +486,7 @@ def test_phases_can_be_left_out_and_added_to(tmp_path):
 
 
 def test_where_U_is_never_seen_nothing_is_synthesised(tmp_path, monkeypatch):
-    found = experiment(tmp_path, "synthesis.rounds=1", UNSAVED)
+    found = experiment(tmp_path, "synthesis.rounds=1")
     monkeypatch.setattr(type(found.work), "unsafe", lambda self: torch.zeros(len(self.latents["latent"]), dtype=torch.bool))
     found.train()
     assert any("what follows needs both kinds" in text for text in found.work.warnings)

@@ -6,7 +6,7 @@ import copy
 
 import pytest
 import torch
-from test_phases import EVERY_STEP, UNSAVED, assert_same, experiment, killed_after, resumed
+from test_phases import EVERY_STEP, assert_same, experiment, killed_after, resumed
 
 from torchrl_sspl import journal
 from torchrl_sspl.configs import compose
@@ -131,7 +131,7 @@ def test_pictures_that_were_encoded_are_taken_from_the_journal(tmp_path, monkeyp
 
 @pytest.fixture(scope="module")
 def uninterrupted(tmp_path_factory):
-    found, asked, whole = experiment(tmp_path_factory.mktemp("whole"), *STEADY, UNSAVED), [], synthesis._as_changed
+    found, asked, whole = experiment(tmp_path_factory.mktemp("whole"), *STEADY), [], synthesis._as_changed
 
     def seen(work, latent):
         asked.append((work.where["phase"], work.changes.shape, latent))
