@@ -4,7 +4,8 @@ Run: python benchmarks/few_labels.py [env=pendulum] [labels=100,300,1000,all] [t
      [starts=[0.6,0.15,0.25]] [run=false] [score.KEY=VALUE ...] [KEY=VALUE of the training ...]
      python benchmarks/few_labels.py figure [out=runs/few_labels]
 
-Every point is a training of its own, with the recommended settings, one round and no rollouts; a point that has been measured is read.
+Every point is a training of its own, one round without rollouts with the settings of the table's small budget
+(``torchrl_sspl.baselines.sspl.settings`` says where these differ from the recommended ones); a point that has been measured is read.
 Of ``transitions``, recorded under random actions with 15 % of the episodes starting in S and 25 % in U, at most ``labels`` of each
 kind are labelled, those that come first; the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
 ``collector.max_frames_per_traj=1`` records nothing without a label. The level of the set is placed by held-out episodes with labels of their
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import statistics
 import sys
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
@@ -63,23 +65,29 @@ class Point:
         return Path(self.env) / name / str(self.seed) / "point.json"
 
     def measure(self, path: Path, sizes: ScoreConfig) -> dict[str, Any]:
-        """Train and score, or read what has been measured."""
+        """Train and score, or read what has been measured with the same sizes."""
         with RunDirectory(path.parent).held() as directory:
             if path.is_file():
-                return json.loads(path.read_text())
+                row = json.loads(path.read_text())
+                if row.get("score") != asdict(sizes):
+                    raise ConfigError(f"score: expected {row.get('score')}, with which '{path}' was measured, received {asdict(sizes)}; give the same, or remove the point")
+                return row
             few = [] if self.labels == "all" else [f"labels.safe={self.labels}", f"labels.unsafe={self.labels}"]
             method = make("sspl", [f"overrides={json.dumps([f'labels.wrong={self.wrong}', *few, *self.options])}"])
             method.directory, env = directory, Cell("kernel", self.env, seed=self.seed).environment()
             method.fit(None, env, Budget("few", *(round(share * self.transitions) for share in self.starts)), self.seed)
             found = score(method, env, sizes)
-            row = asdict(self) | {"passed": method.notes["passed"], "needs": asdict(method.needs), "measurements": found.to_dict()}
+            row = asdict(self) | {
+                "score": asdict(sizes), "passed": method.notes["passed"], "checks": [asdict(check) for check in method.checks],
+                "needs": asdict(method.needs), "measurements": found.to_dict(),
+            }  # fmt: skip
             write(path, json.dumps(row, indent=1) + "\n")
             return row
 
 
 def table(rows: list[dict[str, Any]]) -> str:
     """One line for each point: means over the seeds, worst in brackets."""
-    head = ["env", "labels of S", "labels of U", "of neither", "transitions", "wrong", "seeds", "passed the checks", *(c for c, _ in COLUMNS)]
+    head = ["env", "labels of S", "labels of U", "of neither", "transitions", "wrong", "seeds", "level, or what the checks found", *(c for c, _ in COLUMNS)]
     lines = [f"| {' | '.join(head)} |", f"| {' | '.join(['---'] * len(head))} |"]
 
     def of(row: dict[str, Any]) -> tuple[Any, ...]:
@@ -94,30 +102,33 @@ def table(rows: list[dict[str, Any]]) -> str:
             mean = f"{100 * sum(values) / len(values):.1f} %" if values else "-"
             cells.append(mean if len(values) < 2 else f"{mean} ({100 * worst:.1f} %)")
         needs = [str(first["needs"][k]) for k in ("safe_labels", "unsafe_labels", "neither_labels", "transitions")]
-        seeds, passed = ", ".join(str(r["seed"]) for r in found), f"{sum(r['passed'] for r in found):.0f} of {len(found)}"
-        lines.append(f"| {' | '.join([first['env'], *needs, str(first['wrong']), seeds, passed, *cells])} |")
+        seeds, checks = ", ".join(str(r["seed"]) for r in found), "; ".join(f"{c['level']:g}" if c["passed"] else c["reason"] for r in found for c in r["checks"])
+        lines.append(f"| {' | '.join([first['env'], *needs, str(first['wrong']), seeds, checks, *cells])} |")
     return "\n".join(lines)
 
 
 def figure(out: Path) -> Path:
-    """Draws volume, share of U called safe and false-safe share of all points below ``out`` with right labels, two panels for each system; returns the picture."""
+    """Draws volume, share of U called safe and false-safe share of all points below ``out`` with right labels, two panels for each system.
+
+    The left one has those of the number of transitions that most points have. Returns the picture.
+    """
     rows = [json.loads(path.read_text()) for path in sorted(out.rglob("point.json"))]
     rows = [row for row in rows if not row["wrong"] and tuple(row["starts"]) == Point.starts]
     if not rows:
         raise ConfigError(f"figure: expected measured points below '{out}', found none; run the benchmark first")
     for row in rows:
         row["labels known"] = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
-        chosen = [o.partition("=")[2] for o in row["options"] if o.startswith("labels.choose=")]
-        row["chosen"] = f", {chosen[0]} labels chosen" if chosen else ""
+        row["how"] = "".join(f", {o.partition('=')[2]} labels chosen" if o.startswith("labels.choose=") else f", {o}" for o in row["options"])
 
     def labels_of(row: dict[str, Any]) -> str:
-        return f"{row['labels']} labels of S and of U{row['chosen']}"
+        return f"{row['labels']} labels of S and of U{row['how']}"
 
     systems = sorted({row["env"] for row in rows})
     drawn = new_figure(9, 2.9 * len(systems))
     for env, (left, right) in zip(systems, drawn.subplots(len(systems), 2, squeeze=False), strict=True):
         of_env = [row for row in rows if row["env"] == env]
-        _panel(left, of_env, "labels known", "labels", lambda row: f"{row['transitions']:,} transitions{row['chosen']}")
+        usual = statistics.mode(row["transitions"] for row in of_env)
+        _panel(left, [row for row in of_env if row["transitions"] == usual], "labels known", "labels", lambda row: f"{row['transitions']:,} transitions{row['how']}")
         several = [row for row in of_env if len({r["transitions"] for r in of_env if labels_of(r) == labels_of(row)}) > 1]
         _panel(right, several, "transitions", "transitions", labels_of)
         left.set(xlabel="labelled pictures", ylabel="%", title=env)
@@ -141,8 +152,11 @@ def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callab
             means = np.array(sorted(tuple(np.mean(of, 0)) for of in groups.values())).reshape(-1, 2)
             ax.plot(*means.T, style, color=colour, label=label if style == "-" else None)
     ax.set(xscale="log", ylim=(-3, 103))
+    places = sorted({row[x] for row in rows})
+    ax.set_xticks(places, [f"{p:,}" for p in places], fontsize=7)
+    ax.minorticks_off()
     if names:
-        ax.legend(fontsize=7, loc="center right")
+        ax.legend(fontsize=7)
 
 
 def main(words: list[str]) -> None:

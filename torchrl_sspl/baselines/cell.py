@@ -142,7 +142,7 @@ def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
     if found.get("weights") != cell.describe().get("weights"):
         return None
     if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
-        raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; choose another out_dir")
+        raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; remove it, or choose another out_dir for one row")
     return row
 
 

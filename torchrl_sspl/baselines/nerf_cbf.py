@@ -5,7 +5,7 @@ fields*, ICRA 2023 (arXiv 2209.12266; code oscartong2001/nerf-cbf-controller): k
 depth} + \beta \lVert v \rVert`, accepted where :math:`h(x') \le \alpha h(x)`, with their constants d = 0.1, beta = 1, alpha = 0.5. Reduced: our camera
 stands still and the robot moves, so the field is two-dimensional and has two parts, a scene and a robot in its own frame, in
 plain torch. Stand-ins: depth is the distance to the nearest place where the learned density of the scene stops a ray (all
-directions, tabulated once), of the pendulum the clearance of the angle; a grid of bounded actions in place of their
+directions, tabulated once), of the pendulum the clearance of the angle, for which the field is learnt and not asked; a grid of bounded actions in place of their
 sampling, which never ends where no action is admitted. On the car the speed is constant, and ``form="speed"`` is of relative
 degree two; ``form="closing"`` takes the closing speed instead. ``pose="estimated"`` reads pictures in place of the true state.
 """
@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from torchrl_sspl.baselines.base import Budget, Needs, OneStepFilter
 from torchrl_sspl.baselines.ceilings import box_of
 from torchrl_sspl.baselines.data import POOL, Recording
-from torchrl_sspl.baselines.perception import Perception, perception_error, train
+from torchrl_sspl.baselines.perception import Perception, fresh_error, train
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
@@ -133,8 +133,7 @@ class NeRFCBF(OneStepFilter):
         self.eyes = None
         if c.pose == "estimated":
             self.eyes = Perception(env, data, c.perception_steps, seed)
-            fresh = slice(0, min(1000, len(data)))
-            self.notes |= perception_error(self.eyes(data.pixels[fresh]), data.state[fresh], env)
+            self.notes |= fresh_error(self.eyes, env)
         self.needs = Needs(
             transitions=len(data), states=len(data), state_at_run_time=c.pose == "true", dynamics="exact",
             claimed="invariance of {h <= 0}, for an exact pose, where some action is admitted",

@@ -1,8 +1,9 @@
 r"""Neural CBF: barrier and controller learnt together on states, behind a network that tells the state from pictures.
 
 Faithful to Harms, Kulkarni, Khedekar, Jacquet, Alexis, *Neural control barrier functions for safe navigation*, IROS 2024 (arXiv
-2407.19907), as far as its abstract goes: barrier and safe controller learnt jointly in simulation with known control-affine
-dynamics, the barrier in the form of a state-dependent quadratic. Stand-ins: a camera in place of a range image, a supervised
+2407.19907), as far as its abstract goes (the rest was not at hand): barrier and safe controller learnt jointly in simulation with known control-affine
+dynamics, the barrier in the form of a state-dependent quadratic. Stand-ins: the simulator's own step in place of
+a control-affine model, a camera in place of a range image, a supervised
 state in place of their latent; hinges and weights are those of neural_clbf as remembered. On the car, where no equilibrium
 exists, h is a plain network of the coordinates.
 """
@@ -17,7 +18,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.baselines.base import Budget, Needs, OneStepFilter
 from torchrl_sspl.baselines.data import Recording
-from torchrl_sspl.baselines.perception import Coordinates, Perception, perception_error, train
+from torchrl_sspl.baselines.perception import Coordinates, Perception, fresh_error, train
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.sets import SAFE, UNSAFE
@@ -92,8 +93,7 @@ class NeuralCBF(OneStepFilter):
         c = self.config
         self.env, self.alpha, self.offset = env, c.alpha, c.offset
         self.eyes = self.stage(("perception_steps",), lambda: Perception(env, data, c.perception_steps, seed))
-        fresh = slice(0, min(1000, len(data)))
-        self.notes |= perception_error(self.eyes(data.pixels[fresh]), data.state[fresh], env)
+        self.notes |= fresh_error(self.eyes, env)
         at = Coordinates(env)
         self.net: nn.Module = QuadraticBarrier(at.high.clone()) if at.pendulum else PlainBarrier(at)
         control = nn.Sequential(mlp((at.size, 48, 48, env.action_dim), nn.SiLU), nn.Tanh())
@@ -120,7 +120,7 @@ class NeuralCBF(OneStepFilter):
         loop = train(seed + 1, c.steps, {self.net: 3e-3, control: 3e-3}, loss, len(data), c.batch)
         self.notes["loss"] = float(loop.loss or 0.0)
         self.needs = Needs(
-            **data.labels(), states=len(data), dynamics="control-affine", claimed="invariance of {h >= 0}: the condition holds on samples"
+            **data.labels(), states=len(data), dynamics="exact", claimed="invariance of {h >= 0}: the condition holds on samples"
         )
 
     def perceive(self, seen: Tensor) -> Tensor:

@@ -60,7 +60,9 @@ class Coordinates:
 
 
 def encoder_for(env: SafetyEnv, size: int, data: Recording) -> FrameEncoder:
-    """The encoder that this library recommends for the system, on pictures of the recording's size; untrained. Source: none.
+    """An encoder for the system, on pictures of the recording's size, untrained: moments for cars, as this library recommends, else convolutions.
+
+    For the pendulum this library recommends ``ContrastEncoder`` on pictures of 64 x 64. Source: none.
 
     Args:
         env: the system.
@@ -148,4 +150,16 @@ def perception_error(told: Tensor, state: Tensor, env: SafetyEnv) -> dict[str, f
     return {f"x{k}_q{int(100 * q)}": float(off[:, k].quantile(q)) for k in range(off.shape[1]) for q in (0.5, 0.99)}
 
 
-__all__ = ["Coordinates", "Perception", "encoder_for", "perception_error", "train"]
+def fresh_error(perceive: Callable[[Tensor], Tensor], env: SafetyEnv, n: int = 1000) -> dict[str, float]:
+    """The same of what a method perceives on n fresh pictures of states drawn uniformly, pixels ``(n, 6, H, W)`` -> states. Source: none.
+
+    Example:
+        >>> fresh_error(lambda pixels: torch.zeros(len(pixels), 2), PixelPendulumEnv(), n=50)["x0_q50"] > 0.5
+        True
+    """
+    state = env.sample_states(n, torch.Generator().manual_seed(0))
+    told = [perceive(env.observe(part)) for part in state.split(250)]
+    return perception_error(torch.cat(told), state, env)
+
+
+__all__ = ["Coordinates", "Perception", "encoder_for", "fresh_error", "perception_error", "train"]

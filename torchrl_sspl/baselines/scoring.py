@@ -291,8 +291,9 @@ def _loops(it: _Score, name: str, keep, index: int) -> list[tuple[Tensor, Tensor
 def _calibrated(it: _Score, sets: tuple[Tensor, Tensor, Tensor], found: list[tuple[Tensor, Tensor]]) -> None:
     """The same sets and episodes at a level that other episodes have placed."""
     names = [f"calibrated_{n}_enter" for n in NOMINALS]
-    if len(found) < 2:
-        it.out.missing("calibrated_claimed_over_kernel", "calibrated_false_safe", "calibrated_unsafe_called_safe", *names, note="nothing is claimed")
+    if len(found) < 2:  # nothing is claimed: a set of size zero, which counts in a mean over seeds
+        _count_sets(it.out, "calibrated_", torch.zeros_like(sets[1]), *sets[1:])
+        it.out.missing(*names, note="nothing is claimed")
         return
     check = it.starts(it.inside, 2, it.config.check_episodes)
     half = check[: len(check) // 2], check[len(check) // 2 :]

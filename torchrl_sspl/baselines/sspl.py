@@ -8,6 +8,7 @@ episodes that start in S or U some leave it. The agent's policy acts by itself; 
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ from torchrl_sspl.evaluation.controllers import AgentController, Camera
 from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.modules.agent import Agent, agent_directory, load
 from torchrl_sspl.runtime.filter import LEVEL, UNPROVED_MARGIN, Shield
+from torchrl_sspl.trainers.phases import Check
 
 # The score's pictures have no noise to be steady under, and an error of one step adds up in a memory alone.
 _PLAIN = ["augmentation.share=0.0", "synthesis.steady_steps=0", "synthesis.dynamics_steps=1500", "synthesis.unsafe_margin=0.05"]
@@ -32,6 +34,12 @@ _ONE_ROUND = ["synthesis.rounds=1", "synthesis.lowest_level=-0.2", "synthesis.gu
 
 def settings(system: str, budget: Budget) -> list[str]:
     """``key=value`` of a training with the transitions of a budget: the recommended settings of a system, with as many steps.
+
+    What differs: where episodes start, how much is recorded and how often it is learnt from; with rollouts, that a further round draws
+    no more of them than the budget has. Without rollouts it is one round; neither a memory nor a proof of one is asked for
+    (``gain``, ``tolerated_error``, ``cover_share``); the checks may lower the level further (``lowest_level``, ``guard``, ``safe_share``); and
+    where the recommended pictures are changed for a memory to be steady under, they are not (``augmentation.share``, ``steady_steps``, with
+    ``dynamics_steps`` and ``unsafe_margin`` that go with that).
 
     Source: none.
 
@@ -84,6 +92,8 @@ class SSPL(SafetyMethod):
         "overrides": ("[]", "[synthesis.residual_spread=1.0]", "[synthesis.residual_spread=2.0]", "[synthesis.margin=0.03]", "[synthesis.tune_steps=8000]"),
     }  # fmt: skip
 
+    checks: Sequence[Check] = ()  # of its training, by round
+
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Load the agent, or train one with the budget; see :meth:`SafetyMethod.fit`."""
         self.env = env
@@ -95,8 +105,9 @@ class SSPL(SafetyMethod):
         proved = "invariance in the learned latent dynamics" if self.agent.tolerated_error > 0 else "the barrier's Lipschitz constant"
         self.needs = Needs(
             transitions=counted.get("transitions", 0), safe_labels=counted.get("labels of S", 0),
-            unsafe_labels=counted.get("labels of U", 0), neither_labels=counted.get("labels of neither", 0), rollouts=counted.get("rollouts", 0), proved=proved,
-            measured="level and round, on held-out episodes", claimed="invariance of {B <= 0}",
+            unsafe_labels=counted.get("labels of U", 0), neither_labels=counted.get("labels of neither", 0), rollouts=counted.get("transitions of rollouts", 0),
+            held_out_labels=counted.get("held-out pictures with a label", 0), held_out_steps=counted.get("held-out steps with a label", 0),
+            proved=proved, measured="level and round, on held-out episodes", claimed="invariance of {B <= 0}",
         )  # fmt: skip
         shield = None
         if self.config.filter:
@@ -116,7 +127,8 @@ class SSPL(SafetyMethod):
         plan = [*settings("pendulum" if isinstance(env, PixelPendulumEnv) else "dubins", budget), *plan]
         experiment = Experiment(compose([*plan, *self.config.overrides]))
         agent = experiment.train().cpu()
-        self.notes["passed"] = float(any(check.passed for check in experiment.work.checks))
+        self.checks = experiment.work.checks
+        self.notes["passed"] = float(any(check.passed for check in self.checks))
         counted = dict(experiment.work.source.budget)
         return agent, counted
 

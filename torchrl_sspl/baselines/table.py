@@ -57,13 +57,14 @@ _MEASURED = (
 )
 _SHIFTS = ("renderer", "dark", "bright", "background", "object")
 _NEEDED = (
-    ("transitions", "transitions"), ("S", "safe_labels"), ("U", "unsafe_labels"), ("states", "states"), ("masks", "masks"),
+    ("transitions", "transitions"), ("of rollouts", "rollouts"), ("S", "safe_labels"), ("U", "unsafe_labels"), ("neither", "neither_labels"),
+    ("held-out labels", "held_out_labels"), ("held-out steps", "held_out_steps"), ("states", "states"), ("masks", "masks"),
     ("expert actions", "expert_actions"), ("state at run time", "state_at_run_time"), ("dynamics", "dynamics"),
 )  # fmt: skip
 
 
 def cells(words: Sequence[str]) -> list[Cell]:
-    """The cells that words ask for: ``methods=a,b:key=value env=pendulum,dubins budget=small seed=0,1 out_dir=... score.*``.
+    """The cells that words ask for: ``methods=a,b:key=value env=pendulum,dubins budget=small seed=0,1 trials=8 score.*``.
 
     Raises ConfigError for a word that is not valid. Source: none.
 
@@ -156,7 +157,7 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
             lines.append([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes])
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
                 shifted.append([label, budget, *(" / ".join(_value(good, _moved(c, shift)) for c in _MEASURED[:3]) for shift in _SHIFTS)])
-            facts = [str(first["needs"][key]) for _, key in _NEEDED]
+            facts = [str(first["needs"].get(key, 0)) for _, key in _NEEDED]
             minutes = sum(row["minutes"]["fit_cpu"] for row in good) / len(good)
             ticks = TICKS.get(first["cell"]["method"], "")
             rests = [" or ".join(dict.fromkeys(row["needs"][name] for row in good)) for name in ("proved", "measured", "claimed")]

@@ -1,4 +1,4 @@
-"""Trials: the same number of random draws from a small space for every method, judged on data that no score sees."""
+"""Trials: as many random draws from a small space for every method, as far as the space has so many, judged on data that no score sees."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ LOST = 10.0  # an episode from the claimed set that enters U costs as much as so
 
 
 def draws(method: str, trials: int, seed: int = SEED) -> list[tuple[str, ...]]:
-    """``key=value`` options of each trial: the defaults first, then random draws from the method's ``space``, none twice.
+    """``key=value`` options of each trial: the defaults first, then random draws from the method's ``space``, none drawn twice.
+
+    A draw may be the defaults, written out. A space with fewer points than trials gives fewer trials.
 
     Source: none.
 

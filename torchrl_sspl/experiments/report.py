@@ -267,7 +267,7 @@ def _notes(outcome: Outcome, env: SafetyEnv | None) -> list[str]:
     if outcome.seconds is not None:
         lines.append(f"Training took {outcome.seconds:.0f} s" + (f"; {outcome.stop_reason}." if outcome.stop_reason else "."))
     if outcome.budget:
-        lines.append("What it was trained on: " + ", ".join(f"{n:,} {what}" for what, n in outcome.budget.items()) + ".")
+        lines.append("What it took: " + ", ".join(f"{n:,} {what}" for what, n in outcome.budget.items()) + ".")
     return [*lines, *((_UNKNOWN,) if env is None else env.system.notes)]
 
 

@@ -141,6 +141,7 @@ class CheckRound(Phase):
             safe = encode_states(agent, env, env.sample_states(n, generator, region=env.safe_set))
             states = env.sample_states(3 * n, generator, region=source.outside_unsafe)
             back = env.sample_states(min(max(1, n // 4), _BACK[0]), generator, region=env.unsafe_set)
+            source.count_held_out(len(in_unsafe) + n, 0)
             self._seen = _Pictures(unsafe, changed, safe, encode_states(agent, env, states), states, back)
         return self._seen
 
@@ -155,11 +156,14 @@ class CheckRound(Phase):
             return None
         episodes = simulate(agent, env, start=start, horizon=s.check_horizon)
         back = simulate(agent, env, start=seen.back, horizon=max(2 * s.check_horizon, _BACK[1]))
+        runs = [episodes, back]
         drift, largest = episodes.innovation[1:].mean(0).norm(dim=-1), math.inf
         if work.observing:
             chance = AgentController(agent, driver=RandomController.within(env, spawn(work.seed, "checks", 1000 + self.number)))
             at_random = simulate(chance, env, start=start[: max(1, n // 10)], horizon=s.check_horizon)
             largest = float(at_random.innovation.norm(dim=-1).max())
+            runs.append(at_random)
+        work.source.count_held_out(0, sum(int(run.alive.sum()) for run in runs))
         return _HeldOut(unsafe, safe, anywhere, episodes, back, drift, largest, changed)
 
     def _check(self, work: Workspace, held_out: _HeldOut, level: float) -> Check:
@@ -214,6 +218,7 @@ class PlaceLevel(Phase):
             held_out = [simulate(acts, env, **run) for acts in (agent, chance)]
         finally:
             env.close()
+        source.count_held_out(0, sum(int(run.alive.sum()) for run in held_out))
         level = separating_level(held_out, s.guard, 0.0 if work.skip else s.margin)
         first = held_out[0].barrier
         if level < 0.0 and first is not None and not bool((first[0] <= level).any()):

@@ -26,6 +26,9 @@ from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Mixture, Region
 _CHUNK = 4096  # transitions whose pictures are held at a time
 _LONGER = 3  # times as long as random ones are the episodes of a policy with memory
 _ENCODED = 1000  # and that are encoded at a time
+# Of what is counted; runs of earlier versions lack them.
+_ROLLOUTS = "transitions of rollouts"
+_HELD_OUT = ("held-out pictures with a label", "held-out steps with a label")
 
 Latents = dict[str, Tensor]
 
@@ -88,7 +91,7 @@ class Source:
         self.starts, self.steps, self.envs, self.seed, self.augmentation = list(starts), steps, envs, seed, augmentation
         changes = augmentation if changes is None else changes
         self.changes = changes if changes is not None and changes.share > 0.0 else None  # what changes nothing is not looked at twice
-        self.budget = {"transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0}
+        self.budget = dict.fromkeys(("transitions", "labels of S", "labels of U", "resets", _ROLLOUTS, *_HELD_OUT), 0)
         self.tell: Callable[[int], None] = lambda transitions: None  # how many it has taken, whenever there are more
 
     @cached_property
@@ -124,6 +127,11 @@ class Source:
         """Adds labels ``(n,)`` that were asked for to the budget, with those that say that a picture is of neither set."""
         for code, name in ((SAFE, "labels of S"), (UNSAFE, "labels of U"), (UNLABELLED, "labels of neither")):
             self.budget[name] = self.budget.get(name, 0) + int((answers == code).sum())
+
+    def count_held_out(self, pictures: int, steps: int) -> None:
+        """Adds fresh pictures and steps of episodes whose labels a check reads; no network learns from them."""
+        for name, n in zip(_HELD_OUT, (pictures, steps), strict=True):
+            self.budget[name] = self.budget.get(name, 0) + n
 
     def stored(self, most: int) -> Latents | None:
         """Latents of the joint training's transitions; of more than ``most``, those of S and U first, up to half, and
@@ -190,12 +198,12 @@ class Source:
                 collect_rollouts(env, exploring, store.max_size, seed=seed, steps=steps, region=region, store=store, **devices)
 
         try:
-            return self._in_chunks(draw, n, index, envs=max(1, _CHUNK // (steps or 1)))
+            return self._in_chunks(draw, n, index, envs=max(1, _CHUNK // (steps or 1)), rollouts=True)
         finally:
             policy.cpu()
 
     def _in_chunks(
-        self, draw: Callable[[EnvBase, TransitionStore, int], None], n: int, index: int, envs: int = _CHUNK
+        self, draw: Callable[[EnvBase, TransitionStore, int], None], n: int, index: int, envs: int = _CHUNK, *, rollouts: bool = False
     ) -> Latents:
         env = self.make_env(batch_size=[min(self.envs, n, envs)], seed=self.seed)
         parts = list[Latents]()
@@ -215,6 +223,8 @@ class Source:
             store = TransitionStore(size, pixel_views=not hasattr(self.encoder, "sequence"), augmentation=changes, labels=labels)
             draw(env, store, seed)
             self.count(store)
+            if rollouts:
+                self.budget[_ROLLOUTS] = self.budget.get(_ROLLOUTS, 0) + len(store)
             parts.append(self._encode(store, torch.arange(len(store))))
             entry.save({"latents": parts[-1], "budget": self.budget}, complete=True)
         if not isinstance(env, SafetyEnv):
