@@ -164,6 +164,15 @@ def test_the_common_set_keeps_from_the_rim(pendulum):
     assert 0.8 < inner.sum() / outer.sum() < 1.0
 
 
+def test_who_claims_nothing_has_an_empty_calibrated_set(pendulum):
+    env, kernel = pendulum
+    method = fitted("lqr", env)
+    method.barrier = lambda seen: torch.ones(len(seen))
+    found = score(method, env, ScoreConfig(episodes=20, horizon=3, grid=21, frames=1), kernel=kernel)
+    assert found["calibrated_claimed_over_kernel"] == found["claimed_over_kernel"] == 0.0  # it counts in a mean over seeds
+    assert found.measurements["calibrated_harmless_enter"].value is None
+
+
 def test_a_calibrated_level_never_rises_and_may_leave_nothing():
     value = torch.linspace(-1, 0, 1001)
     assert calibrated_level(value, torch.zeros(1001, dtype=torch.bool)) == 0.0

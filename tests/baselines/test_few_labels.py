@@ -36,12 +36,16 @@ def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, 
     assert "| 20 | 20 |" not in run("run=false")
     printed = run()
     assert "| pendulum | 20 | 20 | 0 | 1280 | 0.05 | 0 |" in printed
+    check = json.loads((tmp_path / "points.json").read_text())[0]["checks"][0]
+    assert f"| 0.05 | 0 | {check['reason'] or check['level']} |" in printed
     found = json.loads((tmp_path / "points.json").read_text())
     assert [row["labels"] for row in found] == ["20", "all"]
     assert found[1]["needs"]["safe_labels"] > 100
     before = [path.stat().st_mtime_ns for path in sorted(tmp_path.rglob("point.json"))]
     assert run() == printed
     assert run("run=false") == printed
+    with pytest.raises(ConfigError, match=r"score: expected .*'grid': 11.*received .*'grid': 12"):
+        run("score.grid=12")
     assert [path.stat().st_mtime_ns for path in sorted(tmp_path.rglob("point.json"))] == before
 
 
@@ -62,15 +66,18 @@ def test_the_figure_shows_every_training_and_which_of_them_pass(tmp_path, monkey
     point(tmp_path, "100", 2_000, None, passed=False)
     point(tmp_path, "100", 20_000, 0.9, passed=True, wrong=0.01)
     point(tmp_path, "100", 20_000, 0.8, passed=True, options=("labels.choose=40",))
+    point(tmp_path, "100", 20_000, 0.6, passed=True, options=("labels.choose=40", "synthesis.guard=0.02"))
     figure = runpy.run_path(str(BENCHMARK))["figure"]
     monkeypatch.setattr("matplotlib.figure.Figure.savefig", lambda self, path, **look: drawn.append(self))
     drawn: list = []
     figure(tmp_path)
     left, right = drawn[0].axes
     marks = [line for line in left.lines if line.get_marker() == "o"]
-    assert sorted(line.get_ydata()[0] for line in marks) == [50.0, 70.0, 80.0]  # a wrong label makes another figure
+    assert sorted(line.get_ydata()[0] for line in marks) == [50.0, 60.0, 70.0, 80.0]  # a wrong label makes another figure
     assert {line.get_ydata()[0] for line in marks if line.get_markerfacecolor() == "white"} == {70.0}
     assert {line.get_ydata()[0] for line in left.lines if line.get_marker() == "^"} == {10.0}
+    named = [text.get_text() for text in left.get_legend().get_texts()]
+    assert named == ["20,000 transitions", "20,000 transitions, 40 labels chosen", "20,000 transitions, 40 labels chosen, synthesis.guard=0.02"]
     # Those of which 40 labels are chosen have one number of transitions.
     assert [text.get_text() for text in right.get_legend().get_texts()] == ["100 labels of S and of U"]
 

@@ -155,6 +155,16 @@ def test_pictures_are_encoded_once_for_all_levels(monkeypatch):
     assert len(drawn) == count > 0
 
 
+def test_labels_that_the_checks_read_are_counted():
+    work, phase, seen = workspace(), CheckRound(0), []
+    for times in (1, 2):  # a second level has episodes of its own, and the same pictures
+        found = phase._held_out(work, work.agent(0.5))
+        seen += [found.episodes, found.back]
+        assert work.source.budget["held-out pictures with a label"] == 8 * 6 + 6
+        assert work.source.budget["held-out steps with a label"] == sum(int(run.alive.sum()) for run in seen) > 2 * times
+    assert work.source.budget["transitions"] == 0  # nothing is learnt from them
+
+
 def test_where_training_changes_its_pictures_those_of_u_are_held_out_changed_too():
     plain, changed = workspace(), workspace()
     changed.source.changes = Augmentation(share=1.0, noise=40.0)

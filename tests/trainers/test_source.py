@@ -131,6 +131,9 @@ def test_a_policy_is_followed_with_noise_on_its_actions(encoder):
     exact = found.under(policy, 40, 0, exploration=0.0)
     with torch.no_grad():
         torch.testing.assert_close(exact["action"], policy(exact["seen"]), rtol=1e-4, atol=1e-4)
+    assert found.budget["transitions of rollouts"] == found.budget["transitions"] == 40
+    found.random(8, 3)
+    assert (found.budget["transitions of rollouts"], found.budget["transitions"]) == (40, 48)
     noisy = found.under(policy, 400, 0, exploration=0.1)
     with torch.no_grad():
         gap = noisy["action"] - policy(noisy["seen"])
