@@ -69,6 +69,7 @@ class Needs:
         expert_actions: actions of an expert that knows state and dynamics.
         rollouts: transitions under a policy of its own.
         held_out_labels, held_out_steps: fresh pictures, and steps of fresh episodes, whose labels its own checks read.
+            None: not counted, as in the trainings of the shipped agents.
         state_at_run_time: whether it reads the true state when it acts.
         dynamics: "none", "control-affine" (f and g are known) or "exact" (the simulator itself).
         proved, measured, claimed: what is proved of the safe set, what held-out episodes decided, and what is only claimed.
@@ -87,9 +88,9 @@ class Needs:
     states: int = 0
     masks: int = 0
     expert_actions: int = 0
-    rollouts: int = 0
-    held_out_labels: int = 0
-    held_out_steps: int = 0
+    rollouts: int | None = 0
+    held_out_labels: int | None = 0
+    held_out_steps: int | None = 0
     state_at_run_time: bool = False
     dynamics: str = "none"
     proved: str = "nothing"

@@ -251,7 +251,7 @@ def text(row: dict[str, Any]) -> str:
         value = "not measured" if m["value"] is None else f"{100 * m['value']:.2f} %" if m["unit"] == "share" else f"{m['value']:.4g} {m['unit']}"
         bounds = "" if m["lower"] is None or m["upper"] is None else f"  [{100 * m['lower']:.2f}, {100 * m['upper']:.2f}] of {m['n']}"
         lines.append(f"  {name:<34} {value}{bounds}")
-    lines += [f"  needs {name:<28} {value}" for name, value in row["needs"].items() if value not in (0, False, "nothing", "none")]
+    lines += [f"  needs {name:<28} {value}" for name, value in row["needs"].items() if value not in (0, False, None, "nothing", "none")]
     lines.append("  minutes " + ", ".join(f"{name} {value:.1f}" for name, value in row["minutes"].items()))
     return "\n".join(lines)
 

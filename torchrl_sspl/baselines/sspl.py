@@ -105,8 +105,8 @@ class SSPL(SafetyMethod):
         proved = "invariance in the learned latent dynamics" if self.agent.tolerated_error > 0 else "the barrier's Lipschitz constant"
         self.needs = Needs(
             transitions=counted.get("transitions", 0), safe_labels=counted.get("labels of S", 0),
-            unsafe_labels=counted.get("labels of U", 0), neither_labels=counted.get("labels of neither", 0), rollouts=counted.get("transitions of rollouts", 0),
-            held_out_labels=counted.get("held-out pictures with a label", 0), held_out_steps=counted.get("held-out steps with a label", 0),
+            unsafe_labels=counted.get("labels of U", 0), neither_labels=counted.get("labels of neither", 0), rollouts=counted.get("transitions of rollouts"),
+            held_out_labels=counted.get("held-out pictures with a label"), held_out_steps=counted.get("held-out steps with a label"),
             proved=proved, measured="level and round, on held-out episodes", claimed="invariance of {B <= 0}",
         )  # fmt: skip
         shield = None

@@ -157,7 +157,7 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
             lines.append([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes])
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
                 shifted.append([label, budget, *(" / ".join(_value(good, _moved(c, shift)) for c in _MEASURED[:3]) for shift in _SHIFTS)])
-            facts = [str(first["needs"].get(key, 0)) for _, key in _NEEDED]
+            facts = ["not counted" if (n := first["needs"].get(key)) is None else str(n) for _, key in _NEEDED]
             minutes = sum(row["minutes"]["fit_cpu"] for row in good) / len(good)
             ticks = TICKS.get(first["cell"]["method"], "")
             rests = [" or ".join(dict.fromkeys(row["needs"][name] for row in good)) for name in ("proved", "measured", "claimed")]
