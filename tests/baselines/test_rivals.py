@@ -103,6 +103,10 @@ def test_the_shipped_agent_is_a_row_with_its_memory(systems):
     run = simulate(acts, env, start=torch.zeros(2, 2), horizon=5)
     assert acts.deviation > 0
     assert torch.allclose(run.actions[0], torch.tensor(10.0))  # upright there is room: the adversary's own action
+    assert acts.infeasible == 0
+    simulate(acts, env, start=torch.tensor([[0.0, 0.0], [1.5, 1.5]]), horizon=5)
+    assert acts.infeasible == 5  # no action keeps a set that has been left, in one of two episodes
+    assert method.needs.held_out_labels is None  # its training did not count them
 
 
 def test_a_training_needs_a_directory(systems):

@@ -139,10 +139,15 @@ class SSPL(SafetyMethod):
     def act(self, seen: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor]:
         """The agent's action on one observation, without a memory; the loop has one, see :meth:`controller`."""
         latent = self.agent.encode(seen)
-        none = torch.zeros(len(seen), dtype=torch.bool)
         if self.shield is None:
-            return self.agent.policy(latent).detach(), none
-        return self.shield(latent, nominal).action.detach(), none
+            return self.agent.policy(latent).detach(), torch.zeros(len(seen), dtype=torch.bool)
+        return self.protected(latent, nominal)
+
+    def protected(self, latent: Tensor, wanted: Tensor) -> tuple[Tensor, Tensor]:
+        """What the safety filter makes of wanted actions ``(n, m)``, and where no action surely keeps the set, ``(n,)``."""
+        assert self.shield is not None
+        found = self.shield(latent, wanted)
+        return found.action, found.margin < self.shield.level
 
     def controller(self, nominal: Nominal) -> Guarded:
         """The agent in a closed loop, with the memory that belongs to it."""
@@ -171,20 +176,27 @@ class _Remembering(Guarded):
 
     def __init__(self, method: SSPL, nominal: Nominal) -> None:
         super().__init__(method, nominal)
-        shield = method.shield
-        if shield is None:
+        self.lost: Tensor | None = None  # (n,) of the last step
+        if method.shield is None:
             self.inner = AgentController(method.agent)
-        else:
-            self.inner = AgentController(method.agent, _Driver(nominal), lambda latent, wanted: shield(latent, wanted).action)
+            return
+
+        def change(latent: Tensor, wanted: Tensor) -> Tensor:
+            action, self.lost = method.protected(latent, wanted)
+            return action
+
+        self.inner = AgentController(method.agent, _Driver(nominal), change)
 
     def reset(self, rows: Tensor | None = None) -> None:
         """Forget what belongs to all or to some of the episodes."""
         self.inner.reset(rows)
 
     def decide(self, camera: Camera, rows: Tensor | None, wanted: Tensor) -> tuple[Tensor, Tensor]:
-        """The agent's actions; it has no condition that could fail."""
+        """The agent's actions; its policy has no condition that could fail, its filter does where no action keeps the set."""
         action = self.inner.step(camera, rows).action
-        return action, torch.zeros(len(action), dtype=torch.bool)
+        if self.lost is None:
+            return action, torch.zeros(len(action), dtype=torch.bool)
+        return action, self.lost if rows is None else self.lost[rows]
 
 
 __all__ = ["SSPL"]
