@@ -4,6 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # Python compiles what is imported when it is imported: to compile all of it takes about as long as the rest of the installation.
 PIP_INSTALL = $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
+# It has to keep what it has compiled: else every process that the tests start compiles all of torch and TorchRL anew, 4 of its 7 s.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: pendulum quadruped demo table test types suite docs wheel release-check clean
 

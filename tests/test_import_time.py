@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import subprocess
 import sys
+
+MEASURE = """
 import time
-
-
-def seconds(code: str) -> float:
-    start = time.perf_counter()
-    subprocess.run([sys.executable, "-c", code], check=True)
-    return time.perf_counter() - start
+start = time.perf_counter()
+import torchrl
+theirs = time.perf_counter()
+import torchrl_sspl as s
+s.SSPLLoss
+print(theirs - start, time.perf_counter() - start)
+"""
 
 
 def test_import_takes_less_than_twice_the_time_of_torchrl():
-    """Fastest of alternating runs, so that other work on the machine meets all."""
-    codes = "import torchrl_sspl", "import torchrl_sspl as s; s.SSPLLoss", "import torchrl"
-    runs = [[seconds(code) for code in codes] for _ in range(2)]
-    *ours, theirs = (min(column) for column in zip(*runs, strict=True))
-    assert max(ours) < 2 * theirs, f"expected less than {2 * theirs:.2f} s, took {max(ours):.2f} s"
+    """Of ours, that of TorchRL is a part: in one process, other work on the machine meets both. Three tries, as it may meet one more."""
+    for _ in range(3):
+        done = subprocess.run([sys.executable, "-c", MEASURE], check=True, capture_output=True, text=True)
+        theirs, ours = map(float, done.stdout.split())
+        if ours < 2 * theirs:
+            return
+    raise AssertionError(f"expected less than {2 * theirs:.2f} s, took {ours:.2f} s")

@@ -77,7 +77,8 @@ def prepare(folder: Path) -> Path:
         shutil.copytree(ROOT / part, copy / part, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", copy)
     os.chdir(copy)
-    sys.dont_write_bytecode = True
+    # What is compiled of a mutant must not stand for what comes after it, here or in a process that a test starts.
+    sys.dont_write_bytecode, os.environ["PYTHONDONTWRITEBYTECODE"] = True, "1"
     sys.path[:] = [str(copy), str(copy / "tests"), *(p for p in sys.path if p and Path(p).resolve() not in (ROOT, HERE))]
     sys.meta_path[:] = [finder for finder in sys.meta_path if "editable" not in repr(finder).lower()]
     os.environ["OMP_NUM_THREADS"] = "1"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -58,8 +59,15 @@ def test_the_actions_are_the_agents_own():
         assert torch.equal(monitor.step(pixels).action, controller.step(pixels).action)
 
 
-@pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
-def test_a_compiled_monitor_says_what_the_plain_one_says():
+# To generate C++ takes ten times as long as to trace, and is no part of the monitor; test_filter.py has it in every run.
+GENERATED = pytest.param(
+    "inductor", marks=[pytest.mark.slow, pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")]
+)
+
+
+@pytest.mark.parametrize("backend", ["aot_eager", GENERATED])
+def test_a_compiled_monitor_says_what_the_plain_one_says(monkeypatch, backend):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend=backend))
     plain, graph = (Monitor.load("pendulum", batch_size=2, compile=compile) for compile in (False, True))
     for t, pixels in enumerate(shown(2, 12)):
         pixels = None if t == 5 else torch.zeros_like(pixels) if t == 8 else pixels
