@@ -14,6 +14,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from torchrl_sspl.certification import Budget
 from torchrl_sspl.modules import agent
 
 ROOT = Path(__file__).parents[1]
@@ -55,6 +56,8 @@ CODE = [pytest.param(path, id=str(path.relative_to(DOCS))) for path in PAGES if 
 def test_code_of_the_page_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("torchrl_sspl.modules.agent.ENCODERS", dict(agent.ENCODERS))
+    # Proofs of shipped agents have tests of their own, and pages only print what comes out.
+    monkeypatch.setattr("torchrl_sspl.evaluation.certify.Budget", lambda **_: Budget(boxes=200))
     state = torch.get_rng_state()
     try:
         exec(compile(code(path), str(path), "exec"), {"__name__": "page", **GIVEN.get(path.name, {})})

@@ -18,6 +18,9 @@ def program():
     def run(name: str, *words: str) -> int:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(sys, "argv", [name, *words])
+            # Films have tests of their own; here they are short.
+            patch.setattr("torchrl_sspl.experiments.report._FILM_SECONDS", 0.2)
+            patch.setattr("torchrl_sspl.viz.animation._HOLD", 0.0)
             try:
                 runpy.run_path(str(EXAMPLES / name), run_name="__main__")
             except SystemExit as end:

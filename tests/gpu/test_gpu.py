@@ -14,6 +14,7 @@ import torch
 from conformance.cases import CASES, Case
 from tensordict import TensorDict
 from tiny import SAVED, SINGLE, TINY, TINY_PHASES
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
@@ -142,7 +143,7 @@ def test_experiments_run_on_the_gpu_and_return_an_agent_on_the_cpu(tmp_path):
 @pytest.mark.parametrize(
     "options",
     [
-        pytest.param([], id="plain"),
+        pytest.param([], id="plain", marks=pytest.mark.slow),  # the phases below train in float32
         pytest.param(["trainer.autocast=bfloat16"], id="mixed"),
         pytest.param(["trainer.compile=true"], id="compile", marks=pytest.mark.slow),
     ],
@@ -272,11 +273,22 @@ def test_collected_data_lie_in_host_memory_and_batches_on_the_gpu():
     assert store.sample(8).to("cuda")["frames"].is_cuda
 
 
-def test_agents_are_evaluated_on_the_gpu(tmp_path):
-    experiment = Experiment(compose([*JOINT, f"out_dir={tmp_path}"]))
-    agent, sizes = experiment.train(), EvaluationConfig(episodes=8, envs=8, horizon=4)
-    here = evaluate_episodes(agent, experiment.make_env, sizes)
-    there = evaluate_episodes(agent.cuda(), experiment.make_env, sizes)
+def small_agent() -> Agent:
+    """Networks of the sizes that take no time, as they are drawn."""
+    torch.manual_seed(0)
+    barrier = nn.Sequential(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 1))
+    return Agent(FrameEncoder(3, 32, pool_to=8), LatentDynamics(3, 1, (8,), 10.0), barrier, Policy(3, 1, (8,), 10.0), 2.0)
+
+
+def small_env(batch_size=(1,), seed: int = 0) -> PendulumEnv:
+    return PendulumEnv(batch_size=batch_size, seed=seed, image_size=32)
+
+
+def test_agents_are_evaluated_on_the_gpu():
+    agent, sizes = small_agent(), EvaluationConfig(episodes=8, envs=8, horizon=4)
+    here = evaluate_episodes(agent, small_env, sizes)
+    there = evaluate_episodes(agent.cuda(), small_env, sizes)
+    assert here["on_policy_error_mean"] > 0.1
     assert abs(here["on_policy_error_mean"] - there["on_policy_error_mean"]) < 1e-2
 
 
@@ -307,10 +319,13 @@ def test_quadrupeds_agent_answers_from_the_gpu():
     assert encode_states(agent, env, env.sample_states(3)).device.type == "cpu"
 
 
-def test_certificates_say_the_same_of_an_agent_on_the_gpu(pair):
+@pytest.mark.parametrize("size", ["small", pytest.param("shipped", marks=pytest.mark.slow)])
+def test_certificates_say_the_same_of_an_agent_on_the_gpu(size, request):
+    shipped = size == "shipped"
+    pair, env = (request.getfixturevalue("pair"), PendulumEnv) if shipped else ((small_agent(), small_agent().cuda()), small_env)
     short = {"level": 0.0, "horizon": 5, "budget": Budget(boxes=200)}
-    here, there = (certify(agent, PendulumEnv(batch_size=[1]), episodes=20, **short) for agent in pair)
-    resets = certify_on_episodes(pair[1], PendulumEnv, episodes=20, envs=10, **short)
+    here, there = (certify(agent, env(batch_size=[1]), episodes=20, **short) for agent in pair)
+    resets = certify_on_episodes(pair[1], env, episodes=20, envs=10, **short)
     assert here.weights == there.weights == resets.weights
     for name, layer in here.layers.items():
         assert [(s.name, s.holds) for s in layer.statements] == [(s.name, s.holds) for s in there.layers[name].statements]
