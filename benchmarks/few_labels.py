@@ -30,6 +30,7 @@ import torch
 
 from torchrl_sspl.baselines import Budget, ScoreConfig, make, score
 from torchrl_sspl.baselines.cell import Cell
+from torchrl_sspl.baselines.sspl import SSPL
 from torchrl_sspl.configs.reader import parse
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.files import RunDirectory, write
@@ -74,6 +75,7 @@ class Point:
                 return row
             few = [] if self.labels == "all" else [f"labels.safe={self.labels}", f"labels.unsafe={self.labels}"]
             method = make("sspl", [f"overrides={json.dumps([f'labels.wrong={self.wrong}', *few, *self.options])}"])
+            assert isinstance(method, SSPL)
             method.directory, env = directory, Cell("kernel", self.env, seed=self.seed).environment()
             method.fit(None, env, Budget("few", *(round(share * self.transitions) for share in self.starts)), self.seed)
             found = score(method, env, sizes)
@@ -151,12 +153,13 @@ def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callab
                 ax.plot(*at, mark, color=colour, markerfacecolor=colour if row["passed"] else "white", markersize=5)
             means = np.array(sorted(tuple(np.mean(of, 0)) for of in groups.values())).reshape(-1, 2)
             ax.plot(*means.T, style, color=colour, label=label if style == "-" else None)
-    ax.set(xscale="log", ylim=(-3, 103))
-    places = sorted({row[x] for row in rows})
-    ax.set_xticks(places, [f"{p:,}" for p in places], fontsize=7)
+    ax.set(xscale="log", ylim=(-3, 128), yticks=range(0, 101, 20))  # above is the legend
+    points = {(name(row), row[place]) for row in rows}
+    ticks = sorted({round(statistics.mean(row[x] for row in rows if (name(row), row[place]) == point)) for point in points})
+    ax.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize=7)
     ax.minorticks_off()
     if names:
-        ax.legend(fontsize=7)
+        ax.legend(fontsize=7, loc="upper right")
 
 
 def main(words: list[str]) -> None:

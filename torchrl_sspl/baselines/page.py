@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 DIRECTORY = Path("runs/baselines")
-_COLUMNS = 5
+_COLUMNS, _LETTERS = 5, 30  # of the figure, and of a line above one of its pictures
 _AFTER = 0.5  # s, for which what went wrong is still looked at
 #: Outside the kernel, in it and not claimed, claimed in it, claimed outside of it.
 _COLOURS = ("#ffffff", "#cfd6e4", "#4c9f70", "#c0392b")
@@ -83,7 +84,7 @@ def claims(cells: Sequence[Cell]) -> Figure | None:
     for ax, (title, path) in zip(axes, first.items(), strict=False):
         kinds, extent = _slice(path)
         ax.imshow(kinds, extent=extent, origin="lower", aspect="auto", interpolation="nearest")
-        ax.set_title(title, fontsize=7)
+        ax.set_title("\n".join(textwrap.fill(line, _LETTERS) for line in title.splitlines()), fontsize=7)
         ax.tick_params(labelsize=6)
     return figure
 
