@@ -143,7 +143,7 @@ def figure(out: Path) -> Path:
 
 def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callable[[dict[str, Any]], str]) -> None:
     """One mark for each training over ``x``, and lines through the means of those that share a name and a place."""
-    names = sorted({name(row) for row in rows})
+    names, ticks = sorted({name(row) for row in rows}), set[int]()
     for colour, label in zip(PATH_COLOURS, names, strict=False):
         for measure, mark, style in (("claimed_over_kernel", "o", "-"), ("unsafe_called_safe", "^", "--"), ("false_safe", "s", ":")):
             groups: dict[Any, list[tuple[float, float]]] = {}
@@ -153,10 +153,9 @@ def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callab
                 ax.plot(*at, mark, color=colour, markerfacecolor=colour if row["passed"] else "white", markersize=5)
             means = np.array(sorted(tuple(np.mean(of, 0)) for of in groups.values())).reshape(-1, 2)
             ax.plot(*means.T, style, color=colour, label=label if style == "-" else None)
+            ticks.update(round(mean) for mean in means[:, 0])
     ax.set(xscale="log", ylim=(-3, 128), yticks=range(0, 101, 20))  # above is the legend
-    points = {(name(row), row[place]) for row in rows}
-    ticks = sorted({round(statistics.mean(row[x] for row in rows if (name(row), row[place]) == point)) for point in points})
-    ax.set_xticks(ticks, [f"{tick:,}" for tick in ticks], fontsize=7)
+    ax.set_xticks(sorted(ticks), [f"{tick:,}" for tick in sorted(ticks)], fontsize=7)
     ax.minorticks_off()
     if names:
         ax.legend(fontsize=7, loc="upper right")

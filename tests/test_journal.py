@@ -6,7 +6,7 @@ from contextlib import contextmanager, suppress
 
 import pytest
 import torch
-from torch import nn
+from plain import small_agent
 
 import torchrl_sspl.journal as module
 from torchrl_sspl.certification import closed_loop
@@ -18,8 +18,8 @@ from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.interrupts import Interrupted
 from torchrl_sspl.journal import FOLDER, Entry, journal, kept_parts
 from torchrl_sspl.lipschitz import SandwichBarrier
-from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.modules.agent import Agent, load
+from torchrl_sspl.modules import LatentDynamics, Policy
+from torchrl_sspl.modules.agent import load
 from torchrl_sspl.viability import grid, viability_kernel
 
 
@@ -294,11 +294,8 @@ def test_blocks_of_a_certificate_are_not_drawn_again(tmp_path, monkeypatch):
     from torchrl_sspl.evaluation import certify as module_of_certify
     from torchrl_sspl.evaluation.blocks import StateBlocks
 
-    # Small networks: what takes the time of a certificate of a shipped agent, its proof, is not what is kept here.
-    torch.manual_seed(0)
-    barrier = nn.Sequential(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 1))
-    agent = Agent(FrameEncoder(3, 16, pool_to=8), LatentDynamics(3, 1, (8,)), barrier, Policy(3, 1, (8,)), 2.0)
-    env = PendulumEnv(image_size=16)
+    # What takes the time of a certificate of a shipped agent, its proof, is not what is kept here.
+    agent, env = small_agent(), PendulumEnv(image_size=16)
 
     def layers(name, horizon=2):
         with journal(tmp_path / name, "run"):

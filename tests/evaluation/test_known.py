@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 from evaluation.systems import Predictor, straight_ahead
-from torch import nn
+from plain import small_agent
 
 import torchrl_sspl.evaluation
 from torchrl_sspl.configs.schema import EvaluationConfig
@@ -19,8 +19,7 @@ from torchrl_sspl.evaluation.controllers import as_controller
 from torchrl_sspl.evaluation.known import _Run, barrier_of, encode_states, evaluate, latency, states_where
 from torchrl_sspl.evaluation.measurements import Evaluation, quantiles, share
 from torchrl_sspl.lipschitz import lipschitz_lower
-from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
-from torchrl_sspl.modules.agent import Agent, load
+from torchrl_sspl.modules.agent import load
 from torchrl_sspl.sets import Box
 from torchrl_sspl.viability import viability_kernel
 
@@ -37,12 +36,6 @@ def pendulum() -> PendulumEnv:
 @cache
 def kernel():
     return viability_kernel(pendulum(), resolution=31)
-
-
-def small_agent() -> Agent:
-    torch.manual_seed(0)
-    barrier = nn.Sequential(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 1))
-    return Agent(FrameEncoder(3, 16, pool_to=8), LatentDynamics(3, 1, (8,)), barrier, Policy(3, 1, (8,)), 2.0)
 
 
 @cache

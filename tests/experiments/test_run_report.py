@@ -159,7 +159,7 @@ def test_without_a_training_there_are_no_curves_and_no_claims(pendulum, tmp_path
     assert "Training" not in write_run_report(outcome, env)
     page = page_of(outcome)
     assert "Training took" not in page
-    assert "What it was trained on" not in page
+    assert "What it took:" not in page
     assert "barrier is 2-Lipschitz on all of its domain" in page  # the agent's own proof
 
 

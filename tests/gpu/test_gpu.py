@@ -12,9 +12,9 @@ from pathlib import Path
 import pytest
 import torch
 from conformance.cases import CASES, Case
+from plain import small_agent
 from tensordict import TensorDict
 from tiny import SAVED, SINGLE, TINY, TINY_PHASES
-from torch import nn
 from torchrl.collectors import Collector
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.objectives import SoftUpdate
@@ -273,19 +273,12 @@ def test_collected_data_lie_in_host_memory_and_batches_on_the_gpu():
     assert store.sample(8).to("cuda")["frames"].is_cuda
 
 
-def small_agent() -> Agent:
-    """Networks of the sizes that take no time, as they are drawn."""
-    torch.manual_seed(0)
-    barrier = nn.Sequential(nn.Linear(3, 8), nn.ReLU(), nn.Linear(8, 1))
-    return Agent(FrameEncoder(3, 32, pool_to=8), LatentDynamics(3, 1, (8,), 10.0), barrier, Policy(3, 1, (8,), 10.0), 2.0)
-
-
 def small_env(batch_size=(1,), seed: int = 0) -> PendulumEnv:
     return PendulumEnv(batch_size=batch_size, seed=seed, image_size=32)
 
 
 def test_agents_are_evaluated_on_the_gpu():
-    agent, sizes = small_agent(), EvaluationConfig(episodes=8, envs=8, horizon=4)
+    agent, sizes = small_agent(32, 10.0), EvaluationConfig(episodes=8, envs=8, horizon=4)
     here = evaluate_episodes(agent, small_env, sizes)
     there = evaluate_episodes(agent.cuda(), small_env, sizes)
     assert here["on_policy_error_mean"] > 0.1
@@ -322,7 +315,7 @@ def test_quadrupeds_agent_answers_from_the_gpu():
 @pytest.mark.parametrize("size", ["small", pytest.param("shipped", marks=pytest.mark.slow)])
 def test_certificates_say_the_same_of_an_agent_on_the_gpu(size, request):
     shipped = size == "shipped"
-    pair, env = (request.getfixturevalue("pair"), PendulumEnv) if shipped else ((small_agent(), small_agent().cuda()), small_env)
+    pair, env = (request.getfixturevalue("pair"), PendulumEnv) if shipped else ((small_agent(32, 10.0), small_agent(32, 10.0).cuda()), small_env)
     short = {"level": 0.0, "horizon": 5, "budget": Budget(boxes=200)}
     here, there = (certify(agent, env(batch_size=[1]), episodes=20, **short) for agent in pair)
     resets = certify_on_episodes(pair[1], env, episodes=20, envs=10, **short)

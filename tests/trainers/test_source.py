@@ -114,7 +114,10 @@ def test_pictures_are_held_in_chunks_of_their_own_seeds_and_counted_as_they_come
 
 def test_the_budget_counts_transitions_labels_and_resets(encoder):
     found = build(encoder, starts=[0.25, 0.25, 0.25, 0.25])
-    assert not any(found.budget.values())
+    assert found.budget == {
+        "transitions": 0, "labels of S": 0, "labels of U": 0, "resets": 0, "transitions of rollouts": 0,
+        "held-out pictures with a label": 0, "held-out steps with a label": 0,
+    }  # fmt: skip
     region = torch.cat([found.random(64, 0)["region"], found.random(16, 1)["region"]])
     assert found.budget["transitions"] == 80
     assert found.budget["labels of S"] == int((region == SAFE).sum()) > 0

@@ -141,7 +141,7 @@ class CheckRound(Phase):
             safe = encode_states(agent, env, env.sample_states(n, generator, region=env.safe_set))
             states = env.sample_states(3 * n, generator, region=source.outside_unsafe)
             back = env.sample_states(min(max(1, n // 4), _BACK[0]), generator, region=env.unsafe_set)
-            source.count_held_out(len(in_unsafe) + n, 0)
+            source.count_held_out(len(in_unsafe) + n)
             self._seen = _Pictures(unsafe, changed, safe, encode_states(agent, env, states), states, back)
         return self._seen
 
@@ -163,7 +163,7 @@ class CheckRound(Phase):
             at_random = simulate(chance, env, start=start[: max(1, n // 10)], horizon=s.check_horizon)
             largest = float(at_random.innovation.norm(dim=-1).max())
             runs.append(at_random)
-        work.source.count_held_out(0, sum(int(run.alive.sum()) for run in runs))
+        work.source.count_held_out(0, *runs)
         return _HeldOut(unsafe, safe, anywhere, episodes, back, drift, largest, changed)
 
     def _check(self, work: Workspace, held_out: _HeldOut, level: float) -> Check:
@@ -218,7 +218,7 @@ class PlaceLevel(Phase):
             held_out = [simulate(acts, env, **run) for acts in (agent, chance)]
         finally:
             env.close()
-        source.count_held_out(0, sum(int(run.alive.sum()) for run in held_out))
+        source.count_held_out(0, *held_out)
         level = separating_level(held_out, s.guard, 0.0 if work.skip else s.margin)
         first = held_out[0].barrier
         if level < 0.0 and first is not None and not bool((first[0] <= level).any()):

@@ -17,6 +17,7 @@ from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.data.store import continues
 from torchrl_sspl.direction import direction_of
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.evaluation.simulation import Episodes
 from torchrl_sspl.journal import Entry
 from torchrl_sspl.modules import LatentObserver, Predict
 from torchrl_sspl.modules.salad import make_rollout_policy
@@ -26,9 +27,9 @@ from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Mixture, Region
 _CHUNK = 4096  # transitions whose pictures are held at a time
 _LONGER = 3  # times as long as random ones are the episodes of a policy with memory
 _ENCODED = 1000  # and that are encoded at a time
-# Of what is counted; runs of earlier versions lack them.
-_ROLLOUTS = "transitions of rollouts"
-_HELD_OUT = ("held-out pictures with a label", "held-out steps with a label")
+_COUNTED = (
+    "transitions", "labels of S", "labels of U", "resets", "transitions of rollouts", "held-out pictures with a label", "held-out steps with a label",
+)  # fmt: skip
 
 Latents = dict[str, Tensor]
 
@@ -91,7 +92,7 @@ class Source:
         self.starts, self.steps, self.envs, self.seed, self.augmentation = list(starts), steps, envs, seed, augmentation
         changes = augmentation if changes is None else changes
         self.changes = changes if changes is not None and changes.share > 0.0 else None  # what changes nothing is not looked at twice
-        self.budget = dict.fromkeys(("transitions", "labels of S", "labels of U", "resets", _ROLLOUTS, *_HELD_OUT), 0)
+        self.budget = dict.fromkeys(_COUNTED, 0)
         self.tell: Callable[[int], None] = lambda transitions: None  # how many it has taken, whenever there are more
 
     @cached_property
@@ -128,10 +129,10 @@ class Source:
         for code, name in ((SAFE, "labels of S"), (UNSAFE, "labels of U"), (UNLABELLED, "labels of neither")):
             self.budget[name] = self.budget.get(name, 0) + int((answers == code).sum())
 
-    def count_held_out(self, pictures: int, steps: int) -> None:
-        """Adds fresh pictures and steps of episodes whose labels a check reads; no network learns from them."""
-        for name, n in zip(_HELD_OUT, (pictures, steps), strict=True):
-            self.budget[name] = self.budget.get(name, 0) + n
+    def count_held_out(self, pictures: int, *runs: Episodes) -> None:
+        """Adds fresh pictures and the steps of episodes whose labels a check reads; no network learns from them."""
+        self.budget["held-out pictures with a label"] += pictures
+        self.budget["held-out steps with a label"] += sum(int(run.alive.sum()) for run in runs)
 
     def stored(self, most: int) -> Latents | None:
         """Latents of the joint training's transitions; of more than ``most``, those of S and U first, up to half, and
@@ -212,7 +213,7 @@ class Source:
             entry = Entry("transitions", seed, size)
             kept = entry.saved()
             if kept is not None:
-                self.budget = kept["budget"]
+                self.budget.update(kept["budget"])  # of an earlier version it may lack some
                 self.tell(self.budget["transitions"])
                 parts.append(kept["latents"])
                 continue
@@ -224,7 +225,7 @@ class Source:
             draw(env, store, seed)
             self.count(store)
             if rollouts:
-                self.budget[_ROLLOUTS] = self.budget.get(_ROLLOUTS, 0) + len(store)
+                self.budget["transitions of rollouts"] += len(store)
             parts.append(self._encode(store, torch.arange(len(store))))
             entry.save({"latents": parts[-1], "budget": self.budget}, complete=True)
         if not isinstance(env, SafetyEnv):
