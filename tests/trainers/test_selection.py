@@ -131,13 +131,20 @@ def test_the_level_is_the_highest_that_passes():
     assert allowed.level == pytest.approx(-0.125, abs=1e-6)
 
 
-def test_where_no_level_passes_the_reason_is_that_of_zero_and_nothing_is_kept():
-    work = judged(held_out(unsafe=values(8, usual=0.5, one=-0.5), safe=values(8, usual=-0.5, one=0.2)))
+def test_where_no_level_passes_the_reason_says_what_is_missed_at_zero_and_at_the_lowest_level():
+    mixed = held_out(unsafe=values(8, usual=0.5, one=-0.5), safe=torch.tensor([-0.5, -0.03, 0.2]))
+    work = judged(mixed)
     assert not work.checks[0].passed
     assert work.checks[0].level == 0.0
-    assert work.checks[0].reason == "unsafe inside 1, safe outside 1"
+    assert work.checks[0].reason == "unsafe inside 1, safe outside 1; at level -0.06: unsafe inside 1, safe outside 2"
     assert work.best is None
     assert work.level == 0.0
+    lower, zero = (judged(mixed, workspace(replace(CONFIG, lowest_level=level))).checks[0].reason for level in (-0.2, 0.0))
+    assert lower.endswith("; at level -0.2: unsafe inside 1, safe outside 2")
+    assert zero == "unsafe inside 1, safe outside 1"
+    nothing = held_out(anywhere=torch.tensor([0.05, 0.07]), episodes=episodes([[0.05, 0.05], [0.07, 0.07]]), back=episodes([[0.5, 0.4]]))
+    small = judged(replace(nothing, unsafe=torch.full((8,), 0.01))).checks[0]
+    assert small.reason == "unsafe inside 8; at level -0.06: the set is empty"
 
 
 def test_an_empty_set_is_called_so():

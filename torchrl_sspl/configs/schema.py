@@ -140,6 +140,8 @@ class LabelsConfig:
     unsafe: int | None = _option(None, "the same of U.")
     wrong: float = _option(0.0, "chance that a label is the other one.")
     choose: int = _option(0, "further pictures that are labelled, of S, of U or of neither: those of which the latents tell least.")
+    spread: bool = _option(True, "whether pictures that are left without a label because of unsafe count as of U where those around them are labelled "
+        "as often as in U at large; with choose, what is asked for says that.")
 
 
 @dataclass

@@ -23,6 +23,8 @@ class Labels:
         wrong: chance that a label is the other one, in [0, 1].
         choose: pictures that are labelled beside them once there are latents to choose them by, see
             :func:`~torchrl_sspl.trainers.choose_and_spread`. These may be of neither set.
+        spread: whether pictures beyond ``unsafe`` count as of U where labels of U are as frequent as in U at large, see
+            :func:`~torchrl_sspl.trainers.infer_unsafe`; not with ``choose``.
         seed: of which are wrong.
 
     Raises ConfigError for other values, or if pictures are to be chosen where all are labelled.
@@ -32,7 +34,7 @@ class Labels:
         [1, 2, 0, 0]
     """
 
-    def __init__(self, *, safe: int | None = None, unsafe: int | None = None, wrong: float = 0.0, choose: int = 0, seed: int = 0) -> None:
+    def __init__(self, *, safe: int | None = None, unsafe: int | None = None, wrong: float = 0.0, choose: int = 0, spread: bool = False, seed: int = 0) -> None:
         if any(n is not None and n < 0 for n in (safe, unsafe)) or not 0.0 <= wrong <= 1.0:
             raise ConfigError(f"labels: expected safe and unsafe >= 0 or None, and wrong in [0, 1], received {safe!r}, {unsafe!r}, {wrong!r}")
         if choose < 0 or (choose and None in (safe, unsafe)):
@@ -41,6 +43,7 @@ class Labels:
                 f"safe={safe!r}, unsafe={unsafe!r}; give labels.safe and labels.unsafe, such as 100 each"
             )
         self.most, self.wrong, self.choose, self.seed = {SAFE: safe, UNSAFE: unsafe}, float(wrong), choose, seed
+        self.spread = spread and unsafe is not None and not choose
 
     def less(self, safe: int, unsafe: int, *, seed: int) -> Labels:
         """What is left of them when so many have been used; other ones are wrong."""

@@ -6,7 +6,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:  # what readers of the source, type checkers among them, need to know
-    from torchrl_sspl.trainers.asking import choose_and_spread
+    from torchrl_sspl.trainers.asking import choose_and_spread, infer_unsafe
     from torchrl_sspl.trainers.phases import Check, InnerLoop, Phase, Phases, Workspace
     from torchrl_sspl.trainers.selection import CheckRound, PlaceLevel
     from torchrl_sspl.trainers.source import Source, starts_of
@@ -26,7 +26,7 @@ if TYPE_CHECKING:  # what readers of the source, type checkers among them, need 
     from torchrl_sspl.trainers.trainer import SSPLTrainer
 
 _NAMES = {
-    "choose_and_spread": "asking",
+    **dict.fromkeys(("choose_and_spread", "infer_unsafe"), "asking"),
     **dict.fromkeys(("Check", "InnerLoop", "Phase", "Phases", "Workspace"), "phases"),
     **dict.fromkeys(("CheckRound", "PlaceLevel"), "selection"),
     **dict.fromkeys(("Source", "starts_of"), "source"),
@@ -39,8 +39,8 @@ _NAMES = {
 }
 __all__ = [
     "Check", "CheckRound", "FineTune", "FitDynamics", "FitSets", "Gather", "InnerLoop", "KeepChanges", "Phase", "Phases", "PlaceLevel",
-    "Retry", "SSPLTrainer", "Settle", "Source", "SteadyEncoder", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "choose_and_spread", "starts_of",
-    "synthesis_phases",
+    "Retry", "SSPLTrainer", "Settle", "Source", "SteadyEncoder", "SteerPolicy", "TeachPolicy", "Tighten", "Workspace", "choose_and_spread", "infer_unsafe",
+    "starts_of", "synthesis_phases",
 ]  # fmt: skip
 
 

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+
 import torch
-from torch import Tensor
+from torch import Tensor, nn
+from torch.nn import functional as F
 
 from torchrl_sspl.errors import EmptyRegionError
-from torchrl_sspl.sets import UNLABELLED, UNSAFE
+from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 from torchrl_sspl.viability.cloud import nearest_distance
 
 _ROUNDS = 20  # in which labels are asked for; what they say of the others is computed anew in each
@@ -16,6 +20,9 @@ _SMOOTHING = 0.1  # of f, latent units: the border does not turn to every single
 _AGAINST = 0.9  # value of what the other labels say beyond which one is wrong that says the opposite
 _ENOUGH = 20  # labels of either kind from which on this is asked
 _MOST, _AROUND = 2000, 64  # labels that are interpolated all at once, and of more the nearest ones
+_NETWORKS, _WIDTH = 5, 64  # whose mean says what is of U, and their hidden units
+_STEPS, _BATCH, _LR, _LR_SHARE, _DECAY = 1500, 2048, 3e-3, 3e-2, 1e-3  # with which they are trained
+_LIKELY = -3.0  # log-odds from which on a latent counts as of U: a chance of 5 %
 
 
 @torch.no_grad()
@@ -97,4 +104,79 @@ def _left_out(z: Tensor, y: Tensor) -> Tensor:
     return y - inverse @ y / inverse.diagonal()
 
 
-__all__ = ["choose_and_spread"]
+def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) -> Tensor:
+    r"""Which latents without a label are probably of U, where some of those of U are labelled, at random.
+
+    .. math:: \max_{c, f} \; \sum_{z \in U} \log c \, \sigma(f(z)) + \sum_{z \in S} \log (1 - \sigma(f(z)))
+        + \sum_{z \in D} \log (1 - c \, \sigma(f(z))), \qquad z \text{ counts as of U if } f(z) > -3
+
+    where c is the share of U that is labelled, which comes out, too: where labels of U are as frequent as that, all is of U, and where there are
+    none among many pictures, nothing is. f is the mean of five small networks. That labels are as frequent everywhere in U is assumed
+    (labels that come first are, of pictures that are recorded in one way). Source: Elkan and Noto, *Learning classifiers from only positive and unlabeled
+    data*, KDD 2008; deviation: their c is an average over labels, here it is fitted with f, and labels of S are used. The paper counts what has no label as neither.
+
+    Args:
+        seen: ``(n, p)`` latents of single pictures.
+        region: ``(n,)`` codes of ``sets``, as labelled.
+        drawn: ``(n,)`` bool, which were recorded where there were labels to give; f is learnt from these alone.
+        seed: of the networks' initial weights and batches.
+
+    Returns ``(n,)`` codes, in which only labels say S. Raises EmptyRegionError where nothing of ``drawn`` is labelled U, or nothing is without a label.
+
+    Example:
+        >>> z = torch.rand(4000, 1, generator=torch.Generator().manual_seed(0))
+        >>> labelled = (z[:, 0] > 0.7) & (torch.arange(4000) < 600)  # one in seven of U
+        >>> found = infer_unsafe(z, 2 * labelled, torch.ones(4000, dtype=torch.bool))
+        >>> int(((z[:, 0] > 0.7) & (found != 2)).sum()), int(((z[:, 0] < 0.6) & (found == 2)).sum())
+        (0, 0)
+    """
+    z, code = seen[drawn], region[drawn]
+    unsafe, safe = code == UNSAFE, code == SAFE
+    if not bool(unsafe.any()) or not bool((code == UNLABELLED).any()):
+        raise EmptyRegionError(
+            f"expected labels of U and latents without a label, received {int(unsafe.sum())} and {int((code == UNLABELLED).sum())}; raise labels.unsafe, "
+            "or set labels.spread=false"
+        )
+    mean, scale = z.mean(0), z.std(0).clamp_min(1e-6)
+    generator = torch.Generator().manual_seed(seed)
+    networks = _Several([z.shape[1], _WIDTH, _WIDTH, 1], generator)
+    # From below, since it cannot be less than the share of all latents: from above, f would be low everywhere before it came down.
+    share = nn.Parameter(torch.full((_NETWORKS, 1), math.log(float(unsafe.float().mean()))))
+    groups = [
+        {"params": list(networks.weights), "weight_decay": _DECAY}, {"params": list(networks.biases)}, {"params": [share], "lr": _LR_SHARE},
+    ]  # fmt: skip
+    optimiser = torch.optim.AdamW(groups, lr=_LR, weight_decay=0.0)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
+    for _ in range(_STEPS):
+        rows = torch.randint(len(z), (_BATCH,), generator=generator)
+        f = networks((z[rows] - mean) / scale)
+        known, neither = F.logsigmoid(share) + F.logsigmoid(f), torch.log1p(-share.sigmoid() * f.sigmoid() * (1 - 1e-6))
+        likelihood = torch.where(unsafe[rows], known, torch.where(safe[rows], F.logsigmoid(-f), neither))
+        optimiser.zero_grad()
+        (-likelihood.mean(1).sum()).backward()
+        optimiser.step()
+        schedule.step()
+    with torch.no_grad():
+        likely = torch.cat([networks((part - mean) / scale).mean(0) > _LIKELY for part in seen.split(1 << 15)])
+    return torch.where((region == UNLABELLED) & likely, UNSAFE, region)
+
+
+class _Several(nn.Module):
+    """Networks of the same sizes, side by side: ``(n, p) -> (networks, n)``."""
+
+    def __init__(self, sizes: list[int], generator: torch.Generator) -> None:
+        super().__init__()
+        pairs = list(itertools.pairwise(sizes))
+        self.weights, self.biases = (
+            nn.ParameterList((2 * torch.rand(_NETWORKS, rows, n, generator=generator) - 1) / math.sqrt(m) for m, n in pairs for rows in [m if full else 1])
+            for full in (True, False)
+        )
+
+    def forward(self, x: Tensor) -> Tensor:
+        h = x.expand(_NETWORKS, -1, -1)
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            h = torch.baddbmm(bias, F.silu(h) if k else h, weight)
+        return h[..., 0]
+
+
+__all__ = ["choose_and_spread", "infer_unsafe"]

@@ -82,9 +82,9 @@ class CheckRound(Phase):
             lowest = work.config.lowest_level
             if lowest is None:
                 lowest = -_MOST_OF_MARGIN * work.config.margin  # below it the condition says nothing of the level
-            lowest -= 1e-6
-            checks = (self._check(work, held_out, level) for level in levels if level >= lowest)
-            found = next((c for c in checks if c.passed), None) or self._check(work, held_out, 0.0)
+            tried = [level for level in levels if level >= lowest - 1e-6]
+            checks = (self._check(work, held_out, level) for level in tried)
+            found = next((c for c in checks if c.passed), None) or self._missed(work, held_out, tried[-1])
             if work.config.cover_share > 0:
                 found = self._proved(work, held_out, levels) or found
         work.checks.append(found)
@@ -94,6 +94,13 @@ class CheckRound(Phase):
         rank = [float(sound), float(found.returned >= work.config.return_share), found.size]
         if found.passed and (work.best is None or rank >= list(work.best["rank"])):
             work.keep(rank, self.number, found.level)
+
+    def _missed(self, work: Workspace, held_out: _HeldOut, lowest: float) -> Check:
+        """The check at level 0, with what was found at the lowest level, too, as its reason: no level between them keeps both U out and S in."""
+        found, last = (self._check(work, held_out, level) for level in (0.0, lowest))
+        if not found.passed and lowest < -1e-6:
+            found.reason = f"{found.reason or 'the set is empty'}; at level {lowest:.2g}: {last.reason or 'the set is empty'}"
+        return found
 
     def _proved(self, work: Workspace, held_out: _HeldOut, levels: list[float]) -> Check | None:
         """The largest set that is proved to be kept and passes, with its memory held in it, among a few levels; or None."""
