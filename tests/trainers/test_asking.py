@@ -13,7 +13,7 @@ from torchrl_sspl.data import Labels
 from torchrl_sspl.errors import ConfigError, EmptyRegionError
 from torchrl_sspl.experiments import Experiment
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
-from torchrl_sspl.trainers import Gather, choose_and_spread
+from torchrl_sspl.trainers import Gather, asking, choose_and_spread, infer_unsafe
 
 
 def box(n: int = 6000) -> tuple[torch.Tensor, torch.Tensor]:
@@ -147,3 +147,73 @@ def test_choosing_needs_limits(options):
 def test_choosing_needs_latents():
     with pytest.raises(ConfigError, match=r"labels\.choose=0 with synthesis\.enabled=false"):
         compose(["env=pendulum", "labels.safe=9", "labels.unsafe=9", "labels.choose=5", "synthesis.enabled=false"]).check()
+
+
+def labelled(z: torch.Tensor, answer: torch.Tensor, count: int, within: int) -> torch.Tensor:
+    """Codes of which ``count`` labels of S and U are known, all of the first ``within``."""
+    told = first(torch.where(torch.arange(len(z)) < within, answer, UNLABELLED), count)
+    return torch.where(told, answer, UNLABELLED)
+
+
+def test_labels_that_are_as_frequent_everywhere_in_u_tell_where_u_ends():
+    z, answer = box()
+    region, everywhere = labelled(z, answer, 200, 6000), torch.ones(len(z), dtype=torch.bool)
+    before = torch.random.get_rng_state()
+    found = infer_unsafe(z, region, everywhere, seed=3)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    far = z.abs().amax(1)
+    assert int((region == UNSAFE).sum()) == 200
+    assert int((answer == UNSAFE).sum()) > 3500
+    assert (found[far > 0.65] == UNSAFE).all()
+    assert not (found[far < 0.4] == UNSAFE).any()
+    missed, added = int(((found != UNSAFE) & (answer == UNSAFE)).sum()), int(((found == UNSAFE) & (answer != UNSAFE)).sum())
+    assert missed < added < 600  # caution; of 2,200
+    assert torch.equal(found[region != UNLABELLED], region[region != UNLABELLED])
+    assert torch.equal(found == SAFE, region == SAFE)
+    assert torch.equal(infer_unsafe(z, region, everywhere, seed=3), found)
+
+
+def test_what_was_recorded_without_labels_does_not_count_against_u(monkeypatch):
+    monkeypatch.setattr(asking, "_STEPS", 300)
+    z, answer = box()
+    corner = (z > 0.7).all(1).nonzero()[:, 0].repeat(100)  # many more pictures of a part of U, none of them labelled
+    rows = torch.cat([torch.arange(6000), corner])
+    region = torch.cat([labelled(z, answer, 200, 6000), torch.full((len(corner),), UNLABELLED)])
+    drawn = torch.arange(len(rows)) < 6000
+    found = infer_unsafe(z[rows], region, drawn)
+    assert torch.equal(found[:6000], infer_unsafe(z, region[:6000], drawn[:6000]))
+    assert (found[6000:] == UNSAFE).all()
+    assert not (infer_unsafe(z[rows], region, torch.ones_like(drawn))[6000:] == UNSAFE).any()
+
+
+@pytest.mark.parametrize("codes", [[SAFE, UNLABELLED], [SAFE, UNSAFE]])
+def test_what_is_of_u_is_inferred_from_labels_of_u_and_pictures_without_any(codes):
+    with pytest.raises(EmptyRegionError, match=r"latents without a label, received .* labels\.spread=false"):
+        infer_unsafe(torch.rand(2, 2), torch.tensor(codes), torch.ones(2, dtype=torch.bool))
+
+
+@pytest.mark.parametrize(("words", "inferred"), [([], True), (["labels.spread=false"], False), (["labels.unsafe=100000"], False)])
+def test_a_run_with_few_labels_infers_what_else_is_of_u(words, inferred, tmp_path, monkeypatch):
+    asked = []
+
+    def spread(seen, region, drawn, **seed):
+        asked.append((region.clone(), drawn))
+        return torch.where((torch.arange(len(seen)) % 2 == 0) & (region == UNLABELLED), UNSAFE, region)
+
+    monkeypatch.setattr("torchrl_sspl.trainers.synthesis.infer_unsafe", spread)
+    rounds = ["synthesis.rounds=2", "synthesis.transitions=800", "synthesis.rollout_transitions=40", "synthesis.rim_transitions=40"]
+    run = Experiment(compose([*SINGLE, f"out_dir={tmp_path}", *rounds, "labels.safe=9", "labels.unsafe=11", *words]))
+    run.train()
+    budget, latents = run.work.source.budget, run.work.latents
+    assert bool(asked) == inferred
+    if not inferred:
+        assert int((latents["region"] == UNSAFE).sum()) <= budget["labels of U"]
+        return
+    assert (budget["labels of S"], budget["labels of U"]) == (9, 11)
+    assert int((latents["region"] == UNSAFE).sum()) > 300
+    (first_known, first_drawn), (known, drawn) = asked
+    assert len(known) > len(first_known)
+    assert int((known == UNSAFE).sum()) == 11  # labels alone, not what was made of them
+    assert first_drawn.all()
+    assert int(drawn.sum()) == len(first_drawn)  # the rollouts of the second round have no labels
+    assert drawn[: len(first_drawn)].all()
