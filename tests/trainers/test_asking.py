@@ -183,7 +183,7 @@ def test_what_was_recorded_without_labels_does_not_count_against_u(monkeypatch):
     found = infer_unsafe(z[rows], region, drawn)
     assert torch.equal(found[:6000], infer_unsafe(z, region[:6000], drawn[:6000]))
     assert (found[6000:] == UNSAFE).all()
-    assert not (infer_unsafe(z[rows], region, torch.ones_like(drawn))[6000:] == UNSAFE).any()
+    assert not (infer_unsafe(z[rows], region, torch.ones_like(drawn))[6000:] == UNSAFE).all()
 
 
 @pytest.mark.parametrize("codes", [[SAFE, UNLABELLED], [SAFE, UNSAFE]])
@@ -214,6 +214,6 @@ def test_a_run_with_few_labels_infers_what_else_is_of_u(words, inferred, tmp_pat
     (first_known, first_drawn), (known, drawn) = asked
     assert len(known) > len(first_known)
     assert int((known == UNSAFE).sum()) == 11  # labels alone, not what was made of them
-    assert first_drawn.all()
-    assert int(drawn.sum()) == len(first_drawn)  # the rollouts of the second round have no labels
-    assert drawn[: len(first_drawn)].all()
+    assert 0 < int(first_drawn.sum()) < len(first_drawn)  # what starts in U alone was recorded without labels
+    assert first_drawn[first_known == UNSAFE].all()
+    assert torch.equal(drawn.nonzero(), first_drawn.nonzero())  # and so were the rollouts of the second round
