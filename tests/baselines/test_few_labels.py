@@ -12,6 +12,7 @@ from tiny import TINY_PHASES
 
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.trainers import asking
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "few_labels.py"
 SIZES = ["score.episodes=4", "score.horizon=3", "score.grid=11", "score.kernel_grid=31", "score.frames=1", "score.shifted=0"]
@@ -96,10 +97,19 @@ def test_without_unlabelled_pictures_every_one_has_a_label(tmp_path, monkeypatch
 
 
 def test_wrong_labels_are_found_and_right_ones_used():
-    measure = runpy.run_path(str(BENCHMARK.with_name("wrong_labels.py")))["measure"]
+    measure = runpy.run_path(str(BENCHMARK.with_name("labels_on_states.py")))["measure"]
     right, wrong = (measure(PendulumEnv(), share, 0, 1500) for share in (0.0, 0.05))
     assert right["wrong"] == right["right and not used"] == 0
     assert right["missed"] == right["missed if all labels are used"]
     assert wrong["wrong and not used"] > 0.3 * wrong["wrong"] > 0
     assert wrong["right and not used"] <= 2
     assert wrong["missed"] < wrong["missed if all labels are used"]
+
+
+def test_labels_that_come_first_say_more_by_how_frequent_they_are_than_alone(monkeypatch):
+    monkeypatch.setattr(asking, "_STEPS", 200)
+    inferred = runpy.run_path(str(BENCHMARK.with_name("labels_on_states.py")))["inferred"]
+    found = {name: float(share.split()[0]) for name, share in inferred(PendulumEnv(), 60, 0, 3000).items()}
+    assert found["missed"] < 5 < 90 < found["missed, labels alone"]
+    assert found["added"] < found["added, interpolated"]
+    assert found["added, labels alone"] == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -142,7 +143,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) 
     networks = _Several([z.shape[1], _WIDTH, _WIDTH, 1], generator)
     # From below, since it cannot be less than the share of all latents: from above, f would be low everywhere before it came down.
     share = nn.Parameter(torch.full((_NETWORKS, 1), math.log(float(unsafe.float().mean()))))
-    groups = [
+    groups: list[dict[str, Any]] = [
         {"params": list(networks.weights), "weight_decay": _DECAY}, {"params": list(networks.biases)}, {"params": [share], "lr": _LR_SHARE},
     ]  # fmt: skip
     optimiser = torch.optim.AdamW(groups, lr=_LR, weight_decay=0.0)
