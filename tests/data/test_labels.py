@@ -96,7 +96,7 @@ class _Mean(torch.nn.Module):
 
 def test_a_run_uses_no_more_labels_than_it_may(tmp_path):
     words = [*SINGLE, f"out_dir={tmp_path}"]
-    run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11"]))
+    run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11", "labels.spread=false"]))
     run.train()
     budget = run.work.source.budget
     assert budget["transitions"] > 100
