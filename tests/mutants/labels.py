@@ -25,5 +25,5 @@ MUTANTS = [
     (ASKING, "-share.sigmoid() * f.sigmoid()", "-f.sigmoid()", ASKED),
     (SYNTHESIS, "torch.full_like(part[\"told\"], k < drawn)", "torch.full_like(part[\"told\"], True)", ASKED),
     (SYNTHESIS, "known = torch.where(told, region, UNLABELLED)", "known = region", ASKED),
-    (SYNTHESIS, " and source.budget[\"labels of U\"] >= source.labels.most[UNSAFE]", "", ASKED),
+    (SYNTHESIS, " and source.labels.used_up(source.budget[\"labels of U\"])", "", ASKED),
 ]

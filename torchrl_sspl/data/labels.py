@@ -21,9 +21,10 @@ class Labels:
     Args:
         safe, unsafe: labels of S and of U, at most; None: all.
         wrong: chance that a label is the other one, in [0, 1].
+        share: chance that a picture of S or of U has a label at all, in (0, 1]: labels of all the data, in place of all of the first.
         choose: pictures that are labelled beside them once there are latents to choose them by, see
             :func:`~torchrl_sspl.trainers.choose_and_spread`. These may be of neither set.
-        spread: whether pictures beyond ``unsafe`` count as of U where labels of U are as frequent as in U at large, see
+        spread: whether pictures that ``unsafe`` or ``share`` leaves without a label count as of U where labels of U are as frequent as in U at large, see
             :func:`~torchrl_sspl.trainers.infer_unsafe`; not with ``choose``.
         seed: of which are wrong.
 
@@ -34,16 +35,29 @@ class Labels:
         [1, 2, 0, 0]
     """
 
-    def __init__(self, *, safe: int | None = None, unsafe: int | None = None, wrong: float = 0.0, choose: int = 0, spread: bool = False, seed: int = 0) -> None:
-        if any(n is not None and n < 0 for n in (safe, unsafe)) or not 0.0 <= wrong <= 1.0:
-            raise ConfigError(f"labels: expected safe and unsafe >= 0 or None, and wrong in [0, 1], received {safe!r}, {unsafe!r}, {wrong!r}")
+    def __init__(
+        self,
+        *,
+        safe: int | None = None,
+        unsafe: int | None = None,
+        wrong: float = 0.0,
+        share: float = 1.0,
+        choose: int = 0,
+        spread: bool = False,
+        seed: int = 0,
+    ) -> None:
+        if any(n is not None and n < 0 for n in (safe, unsafe)) or not 0.0 <= wrong <= 1.0 or not 0.0 < share <= 1.0:
+            raise ConfigError(
+                "labels: expected safe and unsafe >= 0 or None, wrong in [0, 1] and share in (0, 1], "
+                f"received {safe!r}, {unsafe!r}, {wrong!r}, {share!r}"
+            )
         if choose < 0 or (choose and None in (safe, unsafe)):
             raise ConfigError(
                 f"labels: expected choose >= 0, and limits of both kinds where pictures are to be chosen, received choose={choose!r} with "
                 f"safe={safe!r}, unsafe={unsafe!r}; give labels.safe and labels.unsafe, such as 100 each"
             )
         self.most, self.wrong, self.choose, self.seed = {SAFE: safe, UNSAFE: unsafe}, float(wrong), choose, seed
-        self.spread = spread and unsafe is not None and not choose
+        self.share, self.spread = float(share), spread and (unsafe is not None or share < 1.0) and not choose
 
     def less(self, safe: int, unsafe: int, *, seed: int) -> Labels:
         """What is left of them when so many have been used; other ones are wrong."""
@@ -58,12 +72,20 @@ class Labels:
         Raises ShapeError for another shape.
         """
         found = self.answers(region, position)
+        if self.share < 1.0:
+            draw = torch.Generator().manual_seed(spawn(self.seed, "spread", position))
+            found[torch.rand(region.shape, generator=draw) >= self.share] = UNLABELLED
         for code, most in self.most.items():
             if most is not None:
                 mine = found == code
                 before = 0 if held is None else int((held == code).sum())
                 found[mine & (mine.cumsum(0) + before > most)] = UNLABELLED
         return found
+
+    def used_up(self, unsafe: int) -> bool:
+        """Whether pictures of U are without a label once so many of U have one."""
+        most = self.most[UNSAFE]
+        return self.share < 1.0 or (most is not None and unsafe >= most)
 
     def answers(self, region: Tensor, position: int = 0) -> Tensor:
         """What is said of every picture ``(n, 1)`` that is asked for, some of it wrong; a ShapeError for another shape."""

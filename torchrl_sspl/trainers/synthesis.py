@@ -125,11 +125,11 @@ class Gather(Phase):
         source.count_labels(answer[data["told"][:, 0] & ~told])
 
     def _spread(self, work: Workspace) -> None:
-        """What pictures without a label probably are, where labels of U have come to an end."""
+        """What pictures without a label probably are, where some of U have none."""
         data, source = work.latents, work.source
         told, drawn, region = (data[k][:, 0] for k in ("told", "drawn", "region"))
         known = torch.where(told, region, UNLABELLED)
-        if bool((known[drawn] == UNSAFE).any()) and source.budget["labels of U"] >= source.labels.most[UNSAFE]:
+        if bool((known[drawn] == UNSAFE).any()) and source.labels.used_up(source.budget["labels of U"]):
             region = infer_unsafe(data["seen"][:, : work.seen_dim], known, drawn, seed=spawn(work.seed, "spread"))
             data["region"] = region[:, None]
 
