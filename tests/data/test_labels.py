@@ -46,6 +46,40 @@ def test_wrong_labels_are_the_other_ones_as_often_as_said():
     assert (Labels(wrong=1.0)(region)[:5000] == UNSAFE).all()
 
 
+def test_a_share_of_the_pictures_is_labelled_all_over_the_data():
+    region = torch.cat([codes(SAFE, UNSAFE, UNLABELLED).repeat(4000, 1)])
+    labels = Labels(share=0.1, seed=3)
+    found = labels(region)
+    for code in (SAFE, UNSAFE):
+        assert torch.isin(found[region == code], torch.tensor([code, UNLABELLED])).all()
+        assert float((found[region == code] == code).float().mean()) == pytest.approx(0.1, abs=0.015)
+        assert int((found[6000:] == code).sum()) > 150
+    assert not found[region == UNLABELLED].any()
+    assert torch.equal(labels(region), found)
+    assert not torch.equal(labels(region, position=1), found)
+    assert int((Labels(share=0.1, unsafe=50, seed=3)(region) == UNSAFE).sum()) == 50
+    wrong = Labels(share=0.1, wrong=1.0, seed=3)(region)
+    assert torch.equal(wrong > 0, found > 0)
+    assert (wrong[found == SAFE] == UNSAFE).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "spread", "unsafe", "up"),
+    [
+        ({}, False, 10**9, False),
+        ({"unsafe": 5}, False, 4, False),
+        ({"unsafe": 5, "spread": True}, True, 5, True),
+        ({"share": 0.5}, True, 0, True),
+        ({"share": 0.5, "spread": False}, False, 0, True),
+        ({"share": 0.5, "safe": 3, "unsafe": 3, "choose": 5, "spread": True}, False, 0, True),
+    ],
+)
+def test_labels_at_random_say_what_the_others_are(options, spread, unsafe, up):
+    labels = Labels(**options)
+    assert labels.spread is spread
+    assert labels.used_up(unsafe) is up
+
+
 def test_what_has_been_used_is_not_used_again():
     left = Labels(safe=5, unsafe=None).less(3, 9, seed=1)
     assert left.most == {SAFE: 2, UNSAFE: None}
@@ -96,7 +130,7 @@ class _Mean(torch.nn.Module):
 
 def test_a_run_uses_no_more_labels_than_it_may(tmp_path):
     words = [*SINGLE, f"out_dir={tmp_path}"]
-    run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11", "labels.spread=false"]))
+    run = Experiment(compose([*words, "labels.safe=9", "labels.unsafe=11"]))
     run.train()
     budget = run.work.source.budget
     assert budget["transitions"] > 100
@@ -105,7 +139,7 @@ def test_a_run_uses_no_more_labels_than_it_may(tmp_path):
     assert Experiment(compose([*SINGLE, f"out_dir={tmp_path}/plain"])).labels is None
 
 
-@pytest.mark.parametrize("options", [{"safe": -1}, {"wrong": 1.5}])
+@pytest.mark.parametrize("options", [{"safe": -1}, {"wrong": 1.5}, {"share": 0.0}, {"share": 1.1}])
 def test_labels_that_cannot_be_are_refused(options):
     with pytest.raises(ConfigError, match="labels: expected"):
         Labels(**options)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 ASKING, ASKED = "torchrl_sspl/trainers/asking.py", "tests/trainers/test_asking.py"
 SYNTHESIS = "torchrl_sspl/trainers/synthesis.py"
+LABELS, DATA = "torchrl_sspl/data/labels.py", "tests/data/test_labels.py"
 
 MUTANTS = [
     (ASKING, "_DOUBT = 0.3", "_DOUBT = 30.0", ASKED),
@@ -26,4 +27,7 @@ MUTANTS = [
     (SYNTHESIS, "torch.full_like(part[\"told\"], k < drawn)", "torch.full_like(part[\"told\"], True)", ASKED),
     (SYNTHESIS, "known = torch.where(told, region, UNLABELLED)", "known = region", ASKED),
     (SYNTHESIS, " and source.labels.used_up(source.budget[\"labels of U\"])", "", ASKED),
+    (LABELS, "generator=draw) >= self.share", "generator=draw) < self.share", DATA),
+    (LABELS, "(share < 1.0 if spread is None else spread)", "bool(spread)", DATA),
+    (LABELS, "return self.share < 1.0 or (most is", "return (most is", DATA),
 ]

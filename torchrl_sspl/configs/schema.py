@@ -141,8 +141,8 @@ class LabelsConfig:
     wrong: float = _option(0.0, "chance that a label is the other one.")
     share: float = _option(1.0, "chance that a picture of S or of U has a label at all: labels of all the data, in place of all of the first.")
     choose: int = _option(0, "further pictures that are labelled, of S, of U or of neither: those of which the latents tell least.")
-    spread: bool = _option(True, "whether pictures that unsafe or share leaves without a label count as of U where those around them are labelled "
-        "as often as in U at large; with choose, what is asked for says that.")
+    spread: bool | None = _option(None, "whether pictures that are left without a label count as of U where labels of U are as frequent as in U "
+        "at large; null: where share is below 1. Not with choose, where what is asked for says that.")
 
 
 @dataclass

@@ -24,8 +24,9 @@ class Labels:
         share: chance that a picture of S or of U has a label at all, in (0, 1]: labels of all the data, in place of all of the first.
         choose: pictures that are labelled beside them once there are latents to choose them by, see
             :func:`~torchrl_sspl.trainers.choose_and_spread`. These may be of neither set.
-        spread: whether pictures that ``unsafe`` or ``share`` leaves without a label count as of U where labels of U are as frequent as in U at large, see
-            :func:`~torchrl_sspl.trainers.infer_unsafe`; not with ``choose``.
+        spread: whether pictures that are left without a label count as of U where labels of U are as frequent as in U at large, see
+            :func:`~torchrl_sspl.trainers.infer_unsafe`; None: where ``share`` is below 1. Not with ``choose``. Labels that come first are of few
+            episodes, side by side, so that what looks free of labels there may be of U.
         seed: of which are wrong.
 
     Raises ConfigError for other values, or if pictures are to be chosen where all are labelled.
@@ -43,7 +44,7 @@ class Labels:
         wrong: float = 0.0,
         share: float = 1.0,
         choose: int = 0,
-        spread: bool = False,
+        spread: bool | None = None,
         seed: int = 0,
     ) -> None:
         if any(n is not None and n < 0 for n in (safe, unsafe)) or not 0.0 <= wrong <= 1.0 or not 0.0 < share <= 1.0:
@@ -57,7 +58,7 @@ class Labels:
                 f"safe={safe!r}, unsafe={unsafe!r}; give labels.safe and labels.unsafe, such as 100 each"
             )
         self.most, self.wrong, self.choose, self.seed = {SAFE: safe, UNSAFE: unsafe}, float(wrong), choose, seed
-        self.share, self.spread = float(share), spread and (unsafe is not None or share < 1.0) and not choose
+        self.share, self.spread = float(share), (share < 1.0 if spread is None else spread) and not choose
 
     def less(self, safe: int, unsafe: int, *, seed: int) -> Labels:
         """What is left of them when so many have been used; other ones are wrong."""
