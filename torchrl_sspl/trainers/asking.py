@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -12,6 +11,7 @@ from torch.nn import functional as F
 
 from torchrl_sspl.errors import EmptyRegionError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
+from torchrl_sspl.trainers.phases import InnerLoop
 from torchrl_sspl.viability.cloud import nearest_distance
 
 _ROUNDS = 20  # in which labels are asked for; what they say of the others is computed anew in each
@@ -22,7 +22,7 @@ _AGAINST = 0.9  # value of what the other labels say beyond which one is wrong t
 _ENOUGH = 20  # labels of either kind from which on this is asked
 _MOST, _AROUND = 2000, 64  # labels that are interpolated all at once, and of more the nearest ones
 _NETWORKS, _WIDTH = 5, 64  # whose mean says what is of U, and their hidden units
-_STEPS, _BATCH, _LR, _LR_SHARE, _DECAY = 1500, 2048, 3e-3, 3e-2, 1e-3  # with which they are trained
+_STEPS, _BATCH, _LR, _LR_SHARE = 1500, 2048, 3e-3, 3e-2  # with which they are trained, and the share of labels beside them
 _LIKELY = -3.0  # log-odds from which on a latent counts as of U: a chance of 5 %
 
 
@@ -139,24 +139,21 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) 
             "or set labels.spread=false"
         )
     mean, scale = z.mean(0), z.std(0).clamp_min(1e-6)
-    generator = torch.Generator().manual_seed(seed)
-    networks = _Several([z.shape[1], _WIDTH, _WIDTH, 1], generator)
-    # From below, since it cannot be less than the share of all latents: from above, f would be low everywhere before it came down.
-    share = nn.Parameter(torch.full((_NETWORKS, 1), math.log(float(unsafe.float().mean()))))
-    groups: list[dict[str, Any]] = [
-        {"params": list(networks.weights), "weight_decay": _DECAY}, {"params": list(networks.biases)}, {"params": [share], "lr": _LR_SHARE},
-    ]  # fmt: skip
-    optimiser = torch.optim.AdamW(groups, lr=_LR, weight_decay=0.0)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, _STEPS)
-    for _ in range(_STEPS):
-        rows = torch.randint(len(z), (_BATCH,), generator=generator)
-        f = networks((z[rows] - mean) / scale)
-        known, neither = F.logsigmoid(share) + F.logsigmoid(f), torch.log1p(-share.sigmoid() * f.sigmoid() * (1 - 1e-6))
-        likelihood = torch.where(unsafe[rows], known, torch.where(safe[rows], F.logsigmoid(-f), neither))
-        optimiser.zero_grad()
-        (-likelihood.mean(1).sum()).backward()
-        optimiser.step()
-        schedule.step()
+    loop = InnerLoop(seed)
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        networks = _Several([z.shape[1], _WIDTH, _WIDTH, 1])
+        # From below, since it cannot be less than the share of all latents: from above, f would be low everywhere before it came down.
+        share = nn.ParameterList([torch.full((_NETWORKS, 1), math.log(float(unsafe.float().mean())))])
+
+        def step() -> dict[str, Tensor]:
+            rows = loop.pick(len(z), _BATCH)
+            f = networks((z[rows] - mean) / scale)
+            known, neither = F.logsigmoid(share[0]) + F.logsigmoid(f), torch.log1p(-share[0].sigmoid() * f.sigmoid() * (1 - 1e-6))
+            likelihood = torch.where(unsafe[rows], known, torch.where(safe[rows], F.logsigmoid(-f), neither))
+            return {"loss_likelihood": -likelihood.mean(1).sum()}
+
+        loop(_STEPS, {networks: _LR, share: _LR_SHARE}, step)
     with torch.no_grad():
         likely = torch.cat([networks((part - mean) / scale).mean(0) > _LIKELY for part in seen.split(1 << 15)])
     return torch.where((region == UNLABELLED) & likely, UNSAFE, region)
@@ -165,13 +162,11 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) 
 class _Several(nn.Module):
     """Networks of the same sizes, side by side: ``(n, p) -> (networks, n)``."""
 
-    def __init__(self, sizes: list[int], generator: torch.Generator) -> None:
+    def __init__(self, sizes: list[int]) -> None:
         super().__init__()
         pairs = list(itertools.pairwise(sizes))
-        self.weights, self.biases = (
-            nn.ParameterList((2 * torch.rand(_NETWORKS, rows, n, generator=generator) - 1) / math.sqrt(m) for m, n in pairs for rows in [m if full else 1])
-            for full in (True, False)
-        )
+        self.weights = nn.ParameterList((2 * torch.rand(_NETWORKS, m, n) - 1) / math.sqrt(m) for m, n in pairs)
+        self.biases = nn.ParameterList((2 * torch.rand(_NETWORKS, 1, n) - 1) / math.sqrt(m) for m, n in pairs)
 
     def forward(self, x: Tensor) -> Tensor:
         h = x.expand(_NETWORKS, -1, -1)
