@@ -34,13 +34,13 @@ def drawn(env: SafetyEnv, seed: int, states: int) -> tuple[Tensor, Tensor]:
     return at.features(x) + NOISE * torch.randn(len(x), at.size, generator=generator), env.region(x).reshape(-1)
 
 
-def inferred(env: SafetyEnv, first: int, seed: int, states: int) -> dict[str, str]:
+def inferred(env: SafetyEnv, first: int, seed: int, states: int, steps: int = 1500) -> dict[str, str]:
     """What is missed of U, and what counts as U and is not, with so many labels of each kind."""
     z, true = drawn(env, seed, states)
     known, unsafe = Labels(safe=first, unsafe=first)(true[:, None])[:, 0], true == UNSAFE
     told = known != UNLABELLED
     found = {
-        "": infer_unsafe(z, known, torch.ones_like(told), seed=seed), ", labels alone": known, ", interpolated": choose_and_spread(z, told, true, 0)[0],
+        "": infer_unsafe(z, known, torch.ones_like(told), steps=steps, seed=seed), ", labels alone": known, ", interpolated": choose_and_spread(z, told, true, 0)[0],
     }  # fmt: skip
     shares = {name: ((unsafe & (of != UNSAFE)).sum() / unsafe.sum(), (~unsafe & (of == UNSAFE)).sum() / (~unsafe).sum()) for name, of in found.items()}
     return {f"{what}{name}": f"{100 * float(pair[k]):.1f} %" for name, pair in shares.items() for k, what in enumerate(("missed", "added"))}

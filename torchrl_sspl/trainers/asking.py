@@ -22,7 +22,7 @@ _AGAINST = 0.9  # value of what the other labels say beyond which one is wrong t
 _ENOUGH = 20  # labels of either kind from which on this is asked
 _MOST, _AROUND = 2000, 64  # labels that are interpolated all at once, and of more the nearest ones
 _NETWORKS, _WIDTH = 5, 64  # whose mean says what is of U, and their hidden units
-_STEPS, _BATCH, _LR, _LR_SHARE = 1500, 2048, 3e-3, 3e-2  # with which they are trained, and the share of labels beside them
+_BATCH, _LR, _LR_SHARE = 2048, 3e-3, 3e-2  # with which they are trained, and the share of labels beside them
 _LIKELY = -4.0  # log-odds from which on a latent counts as of U: a chance of 2 %
 
 
@@ -105,7 +105,7 @@ def _left_out(z: Tensor, y: Tensor) -> Tensor:
     return y - inverse @ y / inverse.diagonal()
 
 
-def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) -> Tensor:
+def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, steps: int = 1500, seed: int = 0) -> Tensor:
     r"""Which latents without a label are probably of U, where some of those of U are labelled, at random.
 
     .. math:: \max_{c, f} \; \sum_{z \in U} \log c \, \sigma(f(z)) + \sum_{z \in S} \log (1 - \sigma(f(z)))
@@ -120,6 +120,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) 
         seen: ``(n, p)`` latents of single pictures.
         region: ``(n,)`` codes of ``sets``, as labelled.
         drawn: ``(n,)`` bool, which were recorded where there were labels to give; f is learnt from these alone.
+        steps: of the optimiser; with fewer, more counts as of U.
         seed: of the networks' initial weights and batches.
 
     Returns ``(n,)`` codes, in which only labels say S. Raises EmptyRegionError where nothing of ``drawn`` is labelled U, or nothing is without a label.
@@ -127,7 +128,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) 
     Example:
         >>> z = torch.rand(4000, 1, generator=torch.Generator().manual_seed(0))
         >>> labelled = (z[:, 0] > 0.7) & (torch.arange(4000) < 600)  # one in seven of U
-        >>> found = infer_unsafe(z, 2 * labelled, torch.ones(4000, dtype=torch.bool))
+        >>> found = infer_unsafe(z, 2 * labelled, torch.ones(4000, dtype=torch.bool), steps=300)
         >>> int(((z[:, 0] > 0.7) & (found != 2)).sum()), int(((z[:, 0] < 0.6) & (found == 2)).sum())
         (0, 0)
     """
@@ -153,7 +154,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, seed: int = 0) 
             likelihood = torch.where(unsafe[rows], known, torch.where(safe[rows], F.logsigmoid(-f), neither))
             return {"loss_likelihood": -likelihood.mean(1).sum()}
 
-        loop(_STEPS, {networks: _LR, share: _LR_SHARE}, step)
+        loop(steps, {networks: _LR, share: _LR_SHARE}, step)
     with torch.no_grad():
         likely = torch.cat([networks((part - mean) / scale).mean(0) > _LIKELY for part in seen.split(1 << 15)])
     return torch.where((region == UNLABELLED) & likely, UNSAFE, region)
