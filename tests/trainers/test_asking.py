@@ -165,9 +165,9 @@ def test_labels_that_are_as_frequent_everywhere_in_u_tell_where_u_ends():
     assert int((region == UNSAFE).sum()) == 200
     assert int((answer == UNSAFE).sum()) > 3500
     assert (found[far > 0.65] == UNSAFE).all()
-    assert not (found[far < 0.25] == UNSAFE).any()
+    assert not (found[far < 0.3] == UNSAFE).any()
     missed, added = int(((found != UNSAFE) & (answer == UNSAFE)).sum()), int(((found == UNSAFE) & (answer != UNSAFE)).sum())
-    assert missed < added < 1000  # caution; of 2,200
+    assert missed < added < 1300  # caution; of 2,200
     assert torch.equal(found[region != UNLABELLED], region[region != UNLABELLED])
     assert torch.equal(found == SAFE, region == SAFE)
     assert torch.equal(infer_unsafe(z, region, everywhere, steps=400, seed=3), found)
