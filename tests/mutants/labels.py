@@ -21,7 +21,7 @@ MUTANTS = [
     (SYNTHESIS, "count = 0 if self.number else source.labels.choose", "count = source.labels.choose", ASKED),
     (SYNTHESIS, "        source.count_labels(answer[data", "        (answer[data", ASKED),
     (ASKING, "z, code = seen[drawn], region[drawn]", "z, code = seen, region", ASKED),
-    (ASKING, "_LIKELY = -4.0", "_LIKELY = 3.0", ASKED),
+    (ASKING, "_LIKELY = -3.0", "_LIKELY = 3.0", ASKED),
     (ASKING, "return torch.where((region == UNLABELLED) & likely, UNSAFE, region)", "return torch.where(likely, UNSAFE, region)", ASKED),
     (ASKING, "-share[0].sigmoid() * f.sigmoid()", "-f.sigmoid()", ASKED),
     (SYNTHESIS, "torch.full_like(part[\"told\"], k < drawn)", "torch.full_like(part[\"told\"], True)", ASKED),

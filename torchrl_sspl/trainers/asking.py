@@ -23,7 +23,7 @@ _ENOUGH = 20  # labels of either kind from which on this is asked
 _MOST, _AROUND = 2000, 64  # labels that are interpolated all at once, and of more the nearest ones
 _NETWORKS, _WIDTH = 5, 64  # whose mean says what is of U, and their hidden units
 _BATCH, _LR, _LR_SHARE = 2048, 3e-3, 3e-2  # with which they are trained, and the share of labels beside them
-_LIKELY = -4.0  # log-odds from which on a latent counts as of U: a chance of 2 %
+_LIKELY = -3.0  # log-odds from which on a latent counts as of U: a chance of 5 %
 
 
 @torch.no_grad()
@@ -109,7 +109,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, steps: int = 15
     r"""Which latents without a label are probably of U, where some of those of U are labelled, at random.
 
     .. math:: \max_{c, f} \; \sum_{z \in U} \log c \, \sigma(f(z)) + \sum_{z \in S} \log (1 - \sigma(f(z)))
-        + \sum_{z \in D} \log (1 - c \, \sigma(f(z))), \qquad z \text{ counts as of U if } f(z) > -4
+        + \sum_{z \in D} \log (1 - c \, \sigma(f(z))), \qquad z \text{ counts as of U if } f(z) > -3
 
     where c is the share of U that is labelled, which comes out, too: where labels of U are as frequent as that, all is of U, and where there are
     none among many pictures, nothing is. f is the mean of five small networks. That labels are as frequent everywhere in U is assumed
