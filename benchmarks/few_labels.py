@@ -7,7 +7,7 @@ Run: python benchmarks/few_labels.py [env=pendulum] [labels=100,300,1000,all] [t
 Every point is a training of its own, one round without rollouts with the settings of the table's small budget
 (``torchrl_sspl.baselines.sspl.settings`` says where these differ from the recommended ones); a point that has been measured is read.
 Of ``transitions``, recorded under random actions with 15 % of the episodes starting in S and 25 % in U, at most ``labels`` of each
-kind are labelled, those that come first; the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
+kind are labelled, those that come first (with ``labels.share=0.1`` at random, of all of them); the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
 ``collector.max_frames_per_traj=1`` records nothing without a label. The level of the set is placed by held-out episodes with labels of their
 own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``; ``figure`` draws all points that there are,
 over the number of labels and over that of the transitions, in ``few_labels.png``.
@@ -120,7 +120,9 @@ def figure(out: Path) -> Path:
         raise ConfigError(f"figure: expected measured points below '{out}', found none; run the benchmark first")
     for row in rows:
         row["labels known"] = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
-        row["how"] = "".join(f", {o.partition('=')[2]} labels chosen" if o.startswith("labels.choose=") else f", {o}" for o in row["options"])
+        words = {"labels.choose": "{} labels chosen", "labels.share": "{} of all labels, at random"}
+        pairs = (o.partition("=")[::2] for o in row["options"])
+        row["how"] = "".join(f", {words.get(key, f'{key}={{}}').format(value)}" for key, value in pairs)
 
     def labels_of(row: dict[str, Any]) -> str:
         return f"{row['labels']} labels of S and of U{row['how']}"
@@ -155,7 +157,11 @@ def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callab
             ax.plot(*means.T, style, color=colour, label=label if style == "-" else None)
             ticks.update(round(mean) for mean in means[:, 0])
     ax.set(xscale="log", ylim=(-3, 128), yticks=range(0, 101, 20))  # above is the legend
-    ax.set_xticks(sorted(ticks), [f"{tick:,}" for tick in sorted(ticks)], fontsize=7)
+    shown = list[int]()
+    for tick in sorted(ticks, reverse=True):
+        if not shown or shown[-1] > 1.4 * tick:  # numbers that lie closer overlap
+            shown.append(tick)
+    ax.set_xticks(shown, [f"{tick:,}" for tick in shown], fontsize=7)
     ax.minorticks_off()
     if names:
         ax.legend(fontsize=7, loc="upper right")
