@@ -26,7 +26,7 @@ MUTANTS = [
     (ASKING, "-share[0].sigmoid() * f.sigmoid()", "-f.sigmoid()", ASKED),
     (SYNTHESIS, "torch.full_like(part[\"told\"], k < drawn)", "torch.full_like(part[\"told\"], True)", ASKED),
     (SYNTHESIS, "known = torch.where(told, region, UNLABELLED)", "known = region", ASKED),
-    (SYNTHESIS, " and source.labels.used_up(source.budget[\"labels of U\"])", "", ASKED),
+    (SYNTHESIS, "if both and source.labels.used_up(source.budget[\"labels of U\"])", "if both", ASKED),
     (LABELS, "generator=draw) >= self.share", "generator=draw) < self.share", DATA),
     (LABELS, "(share < 1.0 if spread is None else spread)", "bool(spread)", DATA),
     (LABELS, "return self.share < 1.0 or (most is", "return (most is", DATA),

@@ -113,7 +113,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, steps: int = 15
 
     where c is the share of U that is labelled, which comes out, too: where labels of U are as frequent as that, all is of U, and where there are
     none among many pictures, nothing is. f is the mean of five small networks. That labels are as frequent everywhere in U is assumed
-    (labels that come first are, of pictures that are recorded in one way). Source: Elkan and Noto, *Learning classifiers from only positive and unlabeled
+    (labels at random are; those that come first are of few episodes). Source: Elkan and Noto, *Learning classifiers from only positive and unlabeled
     data*, KDD 2008; deviation: their c is an average over labels, here it is fitted with f, and labels of S are used. The paper counts what has no label as neither.
 
     Args:

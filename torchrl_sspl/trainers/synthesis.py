@@ -129,7 +129,8 @@ class Gather(Phase):
         data, source = work.latents, work.source
         told, drawn, region = (data[k][:, 0] for k in ("told", "drawn", "region"))
         known = torch.where(told, region, UNLABELLED)
-        if bool((known[drawn] == UNSAFE).any()) and source.labels.used_up(source.budget["labels of U"]):
+        both = all(bool((known[drawn] == code).any()) for code in (UNSAFE, UNLABELLED))
+        if both and source.labels.used_up(source.budget["labels of U"]):
             region = infer_unsafe(data["seen"][:, : work.seen_dim], known, drawn, seed=spawn(work.seed, "spread"))
             data["region"] = region[:, None]
 
