@@ -22,7 +22,6 @@ MUTANTS = [
     (SYNTHESIS, "        source.count_labels(answer[data", "        (answer[data", ASKED),
     (ASKING, "z, code = seen[drawn], region[drawn]", "z, code = seen, region", ASKED),
     (ASKING, "_LIKELY = -3.0", "_LIKELY = 3.0", ASKED),
-    (ASKING, "return torch.where((region == UNLABELLED) & likely, UNSAFE, region)", "return torch.where(likely, UNSAFE, region)", ASKED),
     (ASKING, "-share[0].sigmoid() * f.sigmoid()", "-f.sigmoid()", ASKED),
     (SYNTHESIS, "torch.full_like(part[\"told\"], k < drawn)", "torch.full_like(part[\"told\"], True)", ASKED),
     (SYNTHESIS, "known = torch.where(told, region, UNLABELLED)", "known = region", ASKED),
