@@ -118,9 +118,9 @@ def figure(out: Path) -> Path:
     rows = [row for row in rows if not row["wrong"] and tuple(row["starts"]) == Point.starts]
     if not rows:
         raise ConfigError(f"figure: expected measured points below '{out}', found none; run the benchmark first")
+    words = {"labels.choose": "{} labels chosen", "labels.share": "{} of all labels, at random"}
     for row in rows:
         row["labels known"] = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
-        words = {"labels.choose": "{} labels chosen", "labels.share": "{} of all labels, at random"}
         pairs = (o.partition("=")[::2] for o in row["options"])
         row["how"] = "".join(f", {words.get(key, f'{key}={{}}').format(value)}" for key, value in pairs)
 

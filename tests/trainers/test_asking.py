@@ -13,7 +13,7 @@ from torchrl_sspl.data import Labels
 from torchrl_sspl.errors import ConfigError, EmptyRegionError
 from torchrl_sspl.experiments import Experiment
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
-from torchrl_sspl.trainers import Gather, choose_and_spread, infer_unsafe
+from torchrl_sspl.trainers import asking, choose_and_spread, infer_unsafe
 
 
 def box(n: int = 6000) -> tuple[torch.Tensor, torch.Tensor]:
@@ -133,7 +133,7 @@ def test_labels_are_asked_for_in_the_first_round_alone(number, asked):
     told = torch.zeros(40, 1, dtype=torch.bool).index_fill(0, torch.tensor([0, 39]), True)
     latents = {"seen": seen, "told": told, "answer": torch.where(seen > 0, UNSAFE, SAFE)}
     source = SimpleNamespace(labels=Labels(safe=1, unsafe=1, choose=5), count_labels=lambda answers: counted.append(len(answers)))
-    Gather(number)._choose(SimpleNamespace(latents=latents, source=source, seen_dim=1))
+    asking.tell_of_others(SimpleNamespace(latents=latents, source=source, seen_dim=1), number)
     assert counted == [asked]
     assert int(latents["told"].sum()) == 2 + asked
 
@@ -179,9 +179,12 @@ def test_what_was_recorded_without_labels_does_not_count_against_u():
     rows = torch.cat([torch.arange(6000), corner])
     region = torch.cat([labelled(z, answer, 200, 6000), torch.full((len(corner),), UNLABELLED)])
     drawn = torch.arange(len(rows)) < 6000
+    wrong = int((z.abs().amax(1) > 0.9).nonzero()[-1])
+    region[wrong] = SAFE
     found = infer_unsafe(z[rows], region, drawn, steps=300)
     assert torch.equal(found[:6000], infer_unsafe(z, region[:6000], drawn[:6000], steps=300))
     assert (found[6000:] == UNSAFE).all()
+    assert found[wrong] == SAFE  # a label stays what it is
     assert not (infer_unsafe(z[rows], region, torch.ones_like(drawn), steps=300)[6000:] == UNSAFE).all()
 
 
@@ -199,7 +202,7 @@ def test_a_run_with_few_labels_infers_what_else_is_of_u(words, inferred, tmp_pat
         asked.append((region.clone(), drawn))
         return torch.where((torch.arange(len(seen)) % 2 == 0) & (region == UNLABELLED), UNSAFE, region)
 
-    monkeypatch.setattr("torchrl_sspl.trainers.synthesis.infer_unsafe", spread)
+    monkeypatch.setattr("torchrl_sspl.trainers.asking.infer_unsafe", spread)
     rounds = ["synthesis.rounds=2", "synthesis.transitions=800", "synthesis.rollout_transitions=40", "synthesis.rim_transitions=40"]
     run = Experiment(compose([*SINGLE, f"out_dir={tmp_path}", *rounds, "labels.safe=9", "labels.unsafe=11", *words]))
     run.train()

@@ -83,6 +83,11 @@ class Labels:
                 found[mine & (mine.cumsum(0) + before > most)] = UNLABELLED
         return found
 
+    @property
+    def tells(self) -> bool:
+        """Whether labels say something of pictures that have none."""
+        return bool(self.choose) or self.spread
+
     def used_up(self, unsafe: int) -> bool:
         """Whether pictures of U are without a label once so many of U have one."""
         most = self.most[UNSAFE]

@@ -10,8 +10,9 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from torchrl_sspl.errors import EmptyRegionError
+from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
-from torchrl_sspl.trainers.phases import InnerLoop
+from torchrl_sspl.trainers.phases import InnerLoop, Workspace
 from torchrl_sspl.viability.cloud import nearest_distance
 
 _ROUNDS = 20  # in which labels are asked for; what they say of the others is computed anew in each
@@ -158,6 +159,23 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, steps: int = 15
     with torch.no_grad():
         likely = torch.cat([networks((part - mean) / scale).mean(0) > _LIKELY for part in seen.split(1 << 15)])
     return torch.where((region == UNLABELLED) & likely, UNSAFE, region)
+
+
+def tell_of_others(work: Workspace, number: int) -> None:
+    """What labels say of pictures that have none, in ``work.latents["region"]``; where they are chosen, the first round asks for them. Source: none."""
+    data, source = work.latents, work.source
+    seen, told = data["seen"][:, : work.seen_dim], data["told"][:, 0]
+    if source.labels.choose:
+        answer, count = data["answer"][:, 0], 0 if number else source.labels.choose
+        region, known = choose_and_spread(seen, told, answer, count)
+        source.count_labels(answer[known & ~told])
+        data["told"] = known[:, None]
+    else:
+        drawn, region = data["drawn"][:, 0], torch.where(told, data["region"][:, 0], UNLABELLED)
+        both = all(bool((region[drawn] == code).any()) for code in (UNSAFE, UNLABELLED))
+        if both and source.labels.used_up(source.budget["labels of U"]):
+            region = infer_unsafe(seen, region, drawn, seed=spawn(work.seed, "spread"))
+    data["region"] = region[:, None]
 
 
 class _Several(nn.Module):

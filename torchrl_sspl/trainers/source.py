@@ -238,7 +238,6 @@ class Source:
         where the one before ends."""
         device = next(self.encoder.parameters()).device
         parts, asked = [], ["answer"] if self.labels is not None and self.labels.choose else []
-        told = bool(asked) or (self.labels is not None and self.labels.spread)  # what has a label is not what counts as if it had
         for rows in index.split(_ENCODED):
             batch = store.get(rows)
             if hasattr(self.encoder, "sequence"):
@@ -248,7 +247,7 @@ class Source:
             parts.append((latent.cpu(), after.cpu(), batch["action"], batch["region"], *(batch[k] for k in asked)))
         names = ("seen", "next_seen", "action", "region", *asked)
         found = {k: torch.cat(v) for k, v in zip(names, zip(*parts, strict=True), strict=True)}
-        if told:
+        if self.labels is not None and self.labels.tells:  # what has a label is not what counts as if it had
             found["told"] = found["region"] != UNLABELLED
         neighbours = torch.cat([torch.zeros(1, dtype=torch.bool), index[1:] == index[:-1] + 1])
         return found | {"continues": continues(store, index) & neighbours}

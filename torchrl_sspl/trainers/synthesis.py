@@ -35,8 +35,8 @@ from torchrl_sspl.objectives import (
 from torchrl_sspl.objectives.base import LatentBatch
 from torchrl_sspl.objectives.counterexample import worst_error
 from torchrl_sspl.seeds import spawn
-from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
-from torchrl_sspl.trainers.asking import choose_and_spread, infer_unsafe
+from torchrl_sspl.sets import SAFE, UNSAFE
+from torchrl_sspl.trainers.asking import tell_of_others
 from torchrl_sspl.trainers.phases import Phase, Workspace, action_grid
 from torchrl_sspl.trainers.steady import KeepChanges, SteadyEncoder
 from torchrl_sspl.trainers.targets import observed_errors, off_manifold, remembered, successors, targets, uniform
@@ -97,16 +97,14 @@ class Gather(Phase):
             parts, drawn = [work.latents, self._near_the_set(work)], 0
             if source.known and s.rim_transitions:
                 parts.append(_rim_of_unsafe(work, 20 * self.number + 10))
-        spread = source.labels is not None and source.labels.spread
-        if spread:  # later ones are of other places, and their labels used up: how frequent labels are there says nothing of U
+        labels = source.labels
+        if labels is not None and labels.spread:  # later ones are of other places, and their labels used up: how frequent labels are there says nothing of U
             for k, part in enumerate(parts):
                 part.setdefault("drawn", torch.full_like(part["told"], k < drawn))
         parts = [work.filtered(part) for part in parts]
         work.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
-        if source.labels is not None and source.labels.choose:
-            self._choose(work)
-        elif spread:
-            self._spread(work)
+        if labels is not None and labels.tells:
+            tell_of_others(work, self.number)
         work.cache.clear()
         unsafe = work.unsafe()
         if not bool(unsafe.any()) or bool(unsafe.all()):
@@ -115,24 +113,6 @@ class Gather(Phase):
                 "U, and what follows needs both kinds"
             )
             work.skip = True
-
-    def _choose(self, work: Workspace) -> None:
-        """Asks for labels in the first round, and spreads those that are known."""
-        data, source = work.latents, work.source
-        told, answer = data["told"][:, 0], data["answer"][:, 0]
-        count = 0 if self.number else source.labels.choose
-        data["region"], data["told"] = (x[:, None] for x in choose_and_spread(data["seen"][:, : work.seen_dim], told, answer, count))
-        source.count_labels(answer[data["told"][:, 0] & ~told])
-
-    def _spread(self, work: Workspace) -> None:
-        """What pictures without a label probably are, where some of U have none."""
-        data, source = work.latents, work.source
-        told, drawn, region = (data[k][:, 0] for k in ("told", "drawn", "region"))
-        known = torch.where(told, region, UNLABELLED)
-        both = all(bool((known[drawn] == code).any()) for code in (UNSAFE, UNLABELLED))
-        if both and source.labels.used_up(source.budget["labels of U"]):
-            region = infer_unsafe(data["seen"][:, : work.seen_dim], known, drawn, seed=spawn(work.seed, "spread"))
-            data["region"] = region[:, None]
 
     def _near_the_set(self, work: Workspace) -> dict[str, Tensor]:
         s, source = work.config, work.source
