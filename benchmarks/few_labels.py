@@ -7,7 +7,7 @@ Run: python benchmarks/few_labels.py [env=pendulum] [labels=100,300,1000,all] [t
 Every point is a training of its own, one round without rollouts with the settings of the table's small budget
 (``torchrl_sspl.baselines.sspl.settings`` says where these differ from the recommended ones); a point that has been measured is read.
 Of ``transitions``, recorded under random actions with 15 % of the episodes starting in S and 25 % in U, at most ``labels`` of each
-kind are labelled, those that come first (with ``labels.share=0.1`` at random, of all of them); the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
+kind are labelled, those that come first (with ``labels.share=0.1`` each with that chance); the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
 ``collector.max_frames_per_traj=1`` records nothing without a label. The level of the set is placed by held-out episodes with labels of their
 own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``; ``figure`` draws all points that there are,
 over the number of labels and over that of the transitions, in ``few_labels.png``.
@@ -118,7 +118,7 @@ def figure(out: Path) -> Path:
     rows = [row for row in rows if not row["wrong"] and tuple(row["starts"]) == Point.starts]
     if not rows:
         raise ConfigError(f"figure: expected measured points below '{out}', found none; run the benchmark first")
-    words = {"labels.choose": "{} labels chosen", "labels.share": "{} of all labels, at random"}
+    words = {"labels.choose": "{} labels chosen", "labels.share": "at random, a chance of {}"}
     for row in rows:
         row["labels known"] = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
         pairs = (o.partition("=")[::2] for o in row["options"])
@@ -146,7 +146,7 @@ def figure(out: Path) -> Path:
 def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callable[[dict[str, Any]], str]) -> None:
     """One mark for each training over ``x``, and lines through the means of those that share a name and a place."""
     names, ticks = sorted({name(row) for row in rows}), set[int]()
-    for colour, label in zip(PATH_COLOURS, names, strict=False):
+    for colour, label in zip(itertools.cycle(PATH_COLOURS), names):  # noqa: B905 - of colours there are always enough
         for measure, mark, style in (("claimed_over_kernel", "o", "-"), ("unsafe_called_safe", "^", "--"), ("false_safe", "s", ":")):
             groups: dict[Any, list[tuple[float, float]]] = {}
             for row in (row for row in rows if name(row) == label and row["measurements"][measure]["value"] is not None):

@@ -28,7 +28,8 @@ PURPOSES = {
     "pictures": 15,  # changes of what cameras see
     "labels": 16,  # which of few labels are wrong
     "retries": 17,  # weights of further attempts of a synthesis
-    "spread": 18,  # which pictures have a label, and networks that say what the others are
+    "spread": 18,  # which pictures have a label
+    "inferred labels": 19,  # networks that say what the others are
 }
 _INDICES = 1 << 24
 _MASK = 0xFFFF_FFFF

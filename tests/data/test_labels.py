@@ -10,7 +10,7 @@ from tiny import SINGLE
 from torchrl_sspl.configs import compose
 from torchrl_sspl.data import Labels, TransitionStore, collect_random
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.errors import ConfigError, EmptyRegionError, ShapeError
 from torchrl_sspl.experiments import Experiment
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 from torchrl_sspl.trainers.source import Source
@@ -31,7 +31,7 @@ def test_the_first_labels_of_each_kind_are_kept():
     region = codes(1, 2, 1, 0, 2, 2, 1)
     assert Labels(safe=2, unsafe=1)(region).flatten().tolist() == [1, 2, 1, 0, 0, 0, 0]
     assert Labels(safe=1)(region).flatten().tolist() == [1, 2, 0, 0, 2, 2, 0]
-    assert Labels(safe=2)(region, torch.tensor([1, 1, 2])).flatten().tolist() == [0, 2, 0, 0, 2, 2, 0]
+    assert Labels(safe=3)(region, {SAFE: 2, UNSAFE: 1}).flatten().tolist() == [1, 2, 0, 0, 2, 2, 0]
     assert torch.equal(Labels()(region), region)
 
 
@@ -64,20 +64,39 @@ def test_a_share_of_the_pictures_is_labelled_all_over_the_data():
 
 
 @pytest.mark.parametrize(
-    ("options", "spread", "unsafe", "up"),
+    ("options", "infers", "kept"),
     [
-        ({}, False, 10**9, False),
-        ({"unsafe": 5}, False, 4, False),
-        ({"unsafe": 5, "spread": True}, True, 5, True),
-        ({"share": 0.5}, True, 0, True),
-        ({"share": 0.5, "spread": False}, False, 0, True),
-        ({"share": 0.5, "safe": 3, "unsafe": 3, "choose": 5, "spread": True}, False, 0, True),
+        ({}, False, []),
+        ({"unsafe": 5}, False, []),
+        ({"share": 0.5}, True, ["drawn"]),
+        ({"share": 0.5, "unsafe": 5}, True, ["drawn"]),
+        ({"safe": 3, "unsafe": 3, "choose": 5}, False, ["answer"]),
+        ({"share": 0.5, "safe": 3, "unsafe": 3, "choose": 5}, False, ["answer"]),
     ],
 )
-def test_labels_at_random_say_what_the_others_are(options, spread, unsafe, up):
+def test_labels_at_random_say_what_the_others_are(options, infers, kept):
     labels = Labels(**options)
-    assert labels.spread is spread
-    assert labels.used_up(unsafe) is up
+    assert (labels.infers, labels.kept) == (infers, kept)
+    assert labels.tells is bool(kept)
+    store = TransitionStore(20, labels=labels)
+    store.extend(rows(codes(1, 2, 0)))
+    assert {"answer", "drawn"} & set(store.get(slice(None)).keys()) == set(kept)
+
+
+def test_it_is_known_where_there_were_labels_of_u_left():
+    found = codes(0, 2, 1, 0, 2, 0)
+    assert Labels(unsafe=2).left(found).flatten().tolist() == [True] * 5 + [False]
+    assert Labels(unsafe=2).left(found, {SAFE: 9, UNSAFE: 1}).flatten().tolist() == [True, True, False, False, False, False]
+    assert not Labels(unsafe=0).left(found).any()
+    assert Labels(safe=0).left(found).all()
+
+    store = TransitionStore(100, labels=Labels(share=0.5, unsafe=20))
+    for _ in range(3):
+        store.extend(rows(codes(2).repeat(30, 1)))
+    drawn, last = store.get(slice(None))["drawn"][:, 0], int((store.region == UNSAFE).nonzero().max())
+    assert drawn[: last + 1].all()
+    assert not drawn[last + 1 :].any()
+    assert 30 < last < 60
 
 
 def test_what_has_been_used_is_not_used_again():
@@ -94,8 +113,12 @@ def test_a_store_holds_no_more_labels_than_it_may():
         assert int((store.region == UNSAFE).sum()) <= 2
     assert (store.region == SAFE).sum() == 3
     assert store.get(slice(None))["next", "region"].abs().sum() == 0
-    store.extend(rows(codes(1, 1, 1, 1, 1)))  # in the place of the two labels of S that came first
-    assert (store.region == SAFE).sum() == 3
+    other = TransitionStore(20, labels=Labels(safe=3, unsafe=2))
+    other.load_state_dict(store.state_dict())
+    for again in (store, other):
+        again.extend(rows(codes(1, 1, 1, 1, 1)))  # in the place of the two labels of S that came first: no other one is given
+        assert (again.region == SAFE).sum() == 1
+        assert (again.given, again.recorded) == ({SAFE: 3, UNSAFE: 2}, 25)
     plain = TransitionStore(20)
     plain.extend(rows(codes(1, 2, 0)))
     assert plain.get(slice(None))["next", "region"].flatten().tolist() == [1, 2, 0]
@@ -114,6 +137,32 @@ def test_what_is_collected_later_gets_what_is_left():
     assert int((found == UNSAFE).sum()) == 30 - used
     assert source.budget["labels of U"] == 30
     assert source.budget["transitions"] == 364
+
+
+def test_what_is_overwritten_counts_all_the_same():
+    env = PendulumEnv([16], seed=0)
+    store = TransitionStore(64, labels=Labels(safe=3, unsafe=30))
+    collect_random(env, 160, seed=0, steps=1, store=store)
+    source = Source(PendulumEnv, _Mean(), store=store, labels=Labels(safe=3, unsafe=30), steps=1)
+    source.count(store)
+    assert (source.budget["transitions"], source.budget["labels of U"]) == (160, 30)
+
+
+@pytest.mark.parametrize(("options", "name"), [({"share": 0.5}, "drawn"), ({"safe": 3, "unsafe": 3, "choose": 5}, "answer")])
+def test_a_store_that_was_recorded_with_other_labels_is_refused(options, name):
+    store = TransitionStore(8)
+    collect_random(PendulumEnv([8], seed=0), 8, seed=0, steps=1, store=store)
+    source = Source(PendulumEnv, _Mean(), store=store, labels=Labels(**options))
+    with pytest.raises(ConfigError, match=f"recorded with these labels, received one without {name}"):
+        source.stored(8)
+
+
+def test_answers_that_chosen_labels_took_leave_the_others():
+    source = Source(PendulumEnv, _Mean(), labels=Labels(safe=9, unsafe=30, choose=5), steps=1)
+    source.count_labels(codes(1, 1, 2, 0)[:, 0])
+    found = source.random(300, 0)["region"]
+    assert (int((found == SAFE).sum()), int((found == UNSAFE).sum())) == (9, 30)
+    assert [source.budget[f"chosen labels of {name}"] for name in ("S", "U", "neither")] == [2, 1, 1]
 
 
 class _Mean(torch.nn.Module):
@@ -137,6 +186,23 @@ def test_a_run_uses_no_more_labels_than_it_may(tmp_path):
     assert budget["labels of S"] == 9
     assert budget["labels of U"] == 11
     assert Experiment(compose([*SINGLE, f"out_dir={tmp_path}/plain"])).labels is None
+
+
+@pytest.mark.parametrize(
+    ("words", "problem"),
+    [
+        (["labels.safe=9", "buffer.capacity=100"], r"buffer\.capacity >= trainer\.total_frames=.* with limits of labels, received 100"),
+        (["labels.safe=9", "labels.unsafe=9", "labels.choose=5", "loss=paper"], r"labels\.choose=0 without the synthesis"),
+    ],
+)
+def test_labels_that_would_be_lost_or_never_asked_for_are_refused(words, problem):
+    with pytest.raises(ConfigError, match=problem):
+        compose(["env=pendulum", *words]).check()
+
+
+def test_a_run_without_labels_of_u_says_which_options_give_them(tmp_path):
+    with pytest.raises(EmptyRegionError, match=r"give labels of both \(labels\.safe, labels\.unsafe"):
+        Experiment(compose([*SINGLE, f"out_dir={tmp_path}", "labels.unsafe=0"])).train()
 
 
 @pytest.mark.parametrize("options", [{"safe": -1}, {"wrong": 1.5}, {"share": 0.0}, {"share": 1.1}])

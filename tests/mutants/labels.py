@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 ASKING, ASKED = "torchrl_sspl/trainers/asking.py", "tests/trainers/test_asking.py"
-SYNTHESIS = "torchrl_sspl/trainers/synthesis.py"
+STORE, SOURCE = "torchrl_sspl/data/store.py", "torchrl_sspl/trainers/source.py"
 LABELS, DATA = "torchrl_sspl/data/labels.py", "tests/data/test_labels.py"
 
 MUTANTS = [
@@ -21,13 +21,17 @@ MUTANTS = [
     (ASKING, "0 if number else source.labels.choose", "source.labels.choose", ASKED),
     (ASKING, "        source.count_labels(answer[known", "        (answer[known", ASKED),
     (ASKING, "z, code = seen[drawn], region[drawn]", "z, code = seen, region", ASKED),
-    (ASKING, "_LIKELY = -3.0", "_LIKELY = 3.0", ASKED),
+    (ASKING, "_LIKELY = -4.0", "_LIKELY = 3.0", ASKED),
     (ASKING, "torch.where((region == UNLABELLED) & likely, UNSAFE", "torch.where(likely, UNSAFE", ASKED),
     (ASKING, "-share[0].sigmoid() * f.sigmoid()", "-f.sigmoid()", ASKED),
-    (SYNTHESIS, "torch.full_like(part[\"told\"], k < drawn)", "torch.full_like(part[\"told\"], True)", ASKED),
     (ASKING, "torch.where(told, data[\"region\"][:, 0], UNLABELLED)", "data[\"region\"][:, 0]", ASKED),
-    (ASKING, "if both and source.labels.used_up(source.budget[\"labels of U\"])", "if both", ASKED),
     (LABELS, "generator=draw) >= self.share", "generator=draw) < self.share", DATA),
-    (LABELS, "(share < 1.0 if spread is None else spread)", "bool(spread)", DATA),
-    (LABELS, "return self.share < 1.0 or (most is", "return (most is", DATA),
+    (LABELS, "return self.share < 1.0 and not self.choose", "return self.share < 1.0", DATA),
+    (LABELS, "(given or {}).get(code, 0) > most", "0 > most", DATA),
+    (LABELS, "(given or {}).get(UNSAFE, 0) < most", "0 < most", DATA),
+    (LABELS, " - mine.long()", "", DATA),
+    (STORE, "self.given[code] += int(", "self.given[code] = int(", DATA),
+    (STORE, "meta.get(\"given\", held)", "held", DATA),
+    (STORE, "        self.recorded += data.shape[0]\n", "        self.recorded = self._len\n", DATA),
+    (SOURCE, "\"chosen labels of S\"", "\"labels of S\"", DATA),
 ]

@@ -66,7 +66,7 @@ def settings(system: str, budget: Budget) -> list[str]:
     steps = usual.trainer.optim_steps_per_batch * learning
     return [
         *plan, f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}",
-        f"synthesis.transitions={frames}", *_ONE_ROUND, "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
+        f"buffer.capacity={max(frames, usual.buffer.capacity)}", f"synthesis.transitions={frames}", *_ONE_ROUND, "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
         # A memory, and what is proved of it, are learnt from rollouts.
         "synthesis.gain=1.0", "synthesis.tolerated_error=0.0", "synthesis.cover_share=0.0",
         *(_PLAIN if usual.synthesis.steady_steps else []),
@@ -103,9 +103,10 @@ class SSPL(SafetyMethod):
         else:
             self.agent, counted = self._train(env, budget, seed)
         proved = "invariance in the learned latent dynamics" if self.agent.tolerated_error > 0 else "the barrier's Lipschitz constant"
+        labels = {name: sum(counted.get(f"{how} of {name}", 0) for how in ("labels", "chosen labels")) for name in ("S", "U", "neither")}
         self.needs = Needs(
-            transitions=counted.get("transitions", 0), safe_labels=counted.get("labels of S", 0),
-            unsafe_labels=counted.get("labels of U", 0), neither_labels=counted.get("labels of neither", 0), rollouts=counted.get("transitions of rollouts"),
+            transitions=counted.get("transitions", 0), safe_labels=labels["S"], unsafe_labels=labels["U"], neither_labels=labels["neither"],
+            rollouts=counted.get("transitions of rollouts"),
             held_out_labels=counted.get("held-out pictures with a label"), held_out_steps=counted.get("held-out steps with a label"),
             proved=proved, measured="level and round, on held-out episodes", claimed="invariance of {B <= 0}",
         )  # fmt: skip

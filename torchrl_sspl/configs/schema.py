@@ -139,10 +139,9 @@ class LabelsConfig:
     safe: int | None = _option(None, "labels of S at most, those that come first; everything else is unlabelled; null: all.")
     unsafe: int | None = _option(None, "the same of U.")
     wrong: float = _option(0.0, "chance that a label is the other one.")
-    share: float = _option(1.0, "chance that a picture of S or of U has a label at all: labels of all the data, in place of all of the first.")
+    share: float = _option(1.0, "chance that a picture of S or of U has a label; below 1 labels are spread over more of the data, and, without choose, say which "
+        "pictures without one count as of U.")
     choose: int = _option(0, "further pictures that are labelled, of S, of U or of neither: those of which the latents tell least.")
-    spread: bool | None = _option(None, "whether pictures that are left without a label count as of U where labels of U are as frequent as in U "
-        "at large; null: where share is below 1. Not with choose, where what is asked for says that.")
 
 
 @dataclass
@@ -370,8 +369,7 @@ class Config:
                 f"expected augmentation.share > 0 with synthesis.steady_steps={self.synthesis.steady_steps}, received {self.augmentation.share}: "
                 "there is nothing to be steady under; synthesis.steady_steps=0 leaves the encoder as it is"
             )
-        if self.labels.choose and not self.synthesis.enabled:
-            raise ConfigError(f"expected labels.choose=0 with synthesis.enabled=false, received {self.labels.choose}: pictures are chosen on its latents")
+        self._check_labels()
         if self.synthesis.rounds < 1:
             raise ConfigError(f"expected synthesis.rounds >= 1, received {self.synthesis.rounds}; synthesis.enabled=false for none")
         self._check_least()
@@ -386,6 +384,19 @@ class Config:
         if s.rounds > 1 and s.rollout_transitions < 1:
             raise ConfigError(f"expected synthesis.rollout_transitions >= 1 with synthesis.rounds={s.rounds}, received {s.rollout_transitions}")
         return self
+
+    def _check_labels(self) -> None:
+        labels, kept = self.labels, self.buffer.capacity
+        if labels.choose and not (self.synthesis.enabled and self.loss.preset != "paper"):
+            raise ConfigError(
+                f"expected labels.choose=0 without the synthesis on frozen latents (synthesis.enabled=false, or loss=paper), received {labels.choose}: "
+                "pictures are chosen on its latents"
+            )
+        if (labels.safe, labels.unsafe) != (None, None) and kept < self.trainer.total_frames:
+            raise ConfigError(
+                f"expected buffer.capacity >= trainer.total_frames={self.trainer.total_frames} with limits of labels, received {kept}: what is overwritten "
+                "takes its label with it, and no other one is given"
+            )
 
     def _check_least(self) -> None:
         for least, keys in _LEAST.items():

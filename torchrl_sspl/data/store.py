@@ -39,13 +39,14 @@ class TransitionStore(Storage):
     RGB, height, width), ``"action"``, ``"region"`` int64 ``(n, 1)``, ``("next", "region")``, ``("next",
     "terminated")``; with ``pixel_views`` also ``"pixels"`` and ``("next", "pixels")``, which share the memory of
     ``"frames"``; with ``keep_state`` also ``("info", "state")`` and ``("info", "next_state")``, which no loss reads.
+    ``recorded`` counts all transitions that ever came in, ``given`` the labels of each code among them.
 
     Args:
         capacity: largest number of transitions.
         pixel_views: hand out the observations beside the frames.
         keep_state: keep the true states, for evaluation.
         augmentation: changes frames before they are stored; transitions that follow each other share a camera.
-        labels: which labels are stored: at most so many in the store, and then none of ``("next", "region")``.
+        labels: which labels are stored, at most so many of all that is ever recorded, and none of ``("next", "region")``.
 
     Raises ConfigError if ``capacity`` is not a positive integer. Source: the data sets D, S, U of the paper (Section
     IV): S and U are the labelled part of D, not copies.
@@ -127,6 +128,7 @@ class TransitionStore(Storage):
         data = data.reshape(-1)
         if index.numel() != data.shape[0]:
             raise ShapeError(f"store: expected {index.numel()} transitions, received {data.shape[0]}.")
+        self.recorded += data.shape[0]
         if index.numel() > self.max_size:  # a ring that is passed more than once keeps the last round
             index, data = index[-self.max_size :], data[-self.max_size :]
         if not index.numel():
@@ -134,12 +136,14 @@ class TransitionStore(Storage):
         now, then = _observations(data)
         columns = self._rows(data)
         if self.labels is not None:
-            stays = torch.ones(self._len, dtype=torch.bool)
-            stays[index[index < self._len]] = False
             if self.labels.choose:  # which of the others are asked for is decided later, on latents
                 columns["answer"] = self.labels.answers(columns["region"], int(index[0]))
-            columns["region"] = self.labels(columns["region"], self.region[stays], int(index[0]))
+            columns["region"] = self.labels(columns["region"], self.given, int(index[0]))
+            if self.labels.infers:  # elsewhere nothing is said by a picture that has no label
+                columns["drawn"] = self.labels.left(columns["region"], self.given)
             columns["next_region"] = torch.zeros_like(columns["next_region"])
+        for code in self.given:
+            self.given[code] += int((columns["region"] == code).sum())
         if set_cursor:
             self._set_last_cursor(index)
             self._cursor = int(index[-1] + 1) % self.max_size
@@ -208,8 +212,7 @@ class TransitionStore(Storage):
         )
         if self.pixel_views:
             out["pixels"], out["next", "pixels"] = frames[:, :2].flatten(1, 2), frames[:, 1:].flatten(1, 2)
-        if "answer" in column:
-            out["answer"] = column["answer"]
+        out.update({name: values for name, values in column.items() if name in ("answer", "drawn")})
         if self.keep_state:
             out["info"] = TensorDict(
                 {"state": column["state"], "next_state": column["next_state"]}, batch_size=[rows.numel()]
@@ -241,7 +244,8 @@ class TransitionStore(Storage):
     def state_dict(self) -> dict[str, Any]:
         """All transitions and frames as tensors, frames without gaps; see ``load_state_dict``."""
         state: dict[str, Any] = {name: values[: self._len].clone() for name, values in self._columns.items()}
-        state["_meta"] = {"len": self._len, "cursor": self._cursor, "keep_state": self.keep_state}
+        state["_meta"] = {"len": self._len, "cursor": self._cursor, "keep_state": self.keep_state,
+            "recorded": self.recorded, "given": [self.given[SAFE], self.given[UNSAFE]]}  # fmt: skip
         if self._len:
             used, number = state["triple"].unique(return_inverse=True)
             state["frames"], state["triple"] = self._bank.read(used), number
@@ -268,6 +272,10 @@ class TransitionStore(Storage):
                     self._columns[name] = _column(name, values, self.max_size)
                     self._columns[name][: self._len] = slots[values] if name == "triple" else values
             self._bank.hold(self._columns["triple"][: self._len], +1)
+        # An earlier version did not count what was overwritten.
+        self.recorded = meta.get("recorded", self._len)
+        held = [int((self.region == code).sum()) for code in (SAFE, UNSAFE)]
+        self.given = dict(zip((SAFE, UNSAFE), meta.get("given", held), strict=True))
         self._bump_mutation_revision()
 
     def dumps(self, path: str | os.PathLike[str]) -> None:
@@ -304,6 +312,7 @@ class TransitionStore(Storage):
     def _empty(self) -> None:
         self._len, self._cursor = 0, 0
         self._columns, self._by_region = {}, {}
+        self.recorded, self.given = 0, {SAFE: 0, UNSAFE: 0}
         self._bank = FrameBank(min(_BLOCK, self.max_size + self.max_size // 4 + 64))
 
     def contains(self, item: Any) -> Tensor:
@@ -370,7 +379,9 @@ def _wrong(meta: Any, columns: dict[str, Any]) -> str:
     kinds = {"len": int, "cursor": int, "keep_state": bool}
     if not isinstance(meta, dict) or any(type(meta.get(k)) is not kind for k, kind in kinds.items()):
         return f"'_meta' {meta!r:.60}"
-    n = meta["len"]
+    n, counts = meta["len"], [meta.get("recorded", 0), *meta.get("given", (0, 0))]
+    if len(counts) != 3 or any(type(count) is not int or count < 0 for count in counts):
+        return f"counts {counts!r:.60} of transitions and labels"
     if n < 0 or meta["cursor"] < 0:
         return f"{n} transitions and the cursor at {meta['cursor']}"
     needed = {"frames", "triple", "action", "region", "next_region", "terminated"} if n else set()
@@ -389,7 +400,7 @@ def _wrong(meta: Any, columns: dict[str, Any]) -> str:
         return f"frames {frames.dtype} {tuple(frames.shape)}"
     if triple.dtype != torch.int64 or triple.shape != (n, 3) or int(triple.min()) < 0 or int(triple.max()) >= len(frames):
         return f"'triple' {triple.dtype} {tuple(triple.shape)} with numbers of other frames than the {len(frames)} there are"
-    for name in ("region", "next_region"):
+    for name in {"region", "next_region", "answer"} & set(columns):
         if columns[name].shape != (n, 1) or not set(columns[name].unique().tolist()) <= set(_NAMES):
             return f"'{name}' {tuple(columns[name].shape)} with codes other than {sorted(_NAMES)}"
     return ""

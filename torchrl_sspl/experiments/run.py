@@ -327,8 +327,11 @@ class Experiment:
         try:
             self.trainer.train()
         except EmptyRegionError as error:
+            if self.phases.begun:
+                raise
+            few = "" if self.labels is None else "give labels of both (labels.safe, labels.unsafe, labels.share), "
             raise EmptyRegionError(
-                f"{error} Before the first optimiser step both sets have to be seen: raise "
+                f"{error} Before the first optimiser step both sets have to be seen: {few}raise "
                 "collector.init_random_frames, start episodes there (reset_options of the environment), let them go on "
                 "where gymnasium ends them (ignore_termination), or lower buffer.safe or buffer.unsafe to 0."
             ) from error

@@ -24,7 +24,7 @@ _ENOUGH = 20  # labels of either kind from which on this is asked
 _MOST, _AROUND = 2000, 64  # labels that are interpolated all at once, and of more the nearest ones
 _NETWORKS, _WIDTH = 5, 64  # whose mean says what is of U, and their hidden units
 _BATCH, _LR, _LR_SHARE = 2048, 3e-3, 3e-2  # with which they are trained, and the share of labels beside them
-_LIKELY = -3.0  # log-odds from which on a latent counts as of U: a chance of 5 %
+_LIKELY = -4.0  # log-odds from which on a latent counts as of U: a chance of 2 %
 
 
 @torch.no_grad()
@@ -110,7 +110,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, steps: int = 15
     r"""Which latents without a label are probably of U, where some of those of U are labelled, at random.
 
     .. math:: \max_{c, f} \; \sum_{z \in U} \log c \, \sigma(f(z)) + \sum_{z \in S} \log (1 - \sigma(f(z)))
-        + \sum_{z \in D} \log (1 - c \, \sigma(f(z))), \qquad z \text{ counts as of U if } f(z) > -3
+        + \sum_{z \in D} \log (1 - c \, \sigma(f(z))), \qquad z \text{ counts as of U if } f(z) > -4
 
     where c is the share of U that is labelled, which comes out, too: where labels of U are as frequent as that, all is of U, and where there are
     none among many pictures, nothing is. f is the mean of five small networks. That labels are as frequent everywhere in U is assumed
@@ -120,7 +120,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, steps: int = 15
     Args:
         seen: ``(n, p)`` latents of single pictures.
         region: ``(n,)`` codes of ``sets``, as labelled.
-        drawn: ``(n,)`` bool, which were recorded where there were labels to give; f is learnt from these alone.
+        drawn: ``(n,)`` bool, which were recorded while there were labels of U left; f is learnt from these alone.
         steps: of the optimiser; with fewer, more counts as of U.
         seed: of the networks' initial weights and batches.
 
@@ -138,7 +138,7 @@ def infer_unsafe(seen: Tensor, region: Tensor, drawn: Tensor, *, steps: int = 15
     if not bool(unsafe.any()) or not bool((code == UNLABELLED).any()):
         raise EmptyRegionError(
             f"expected labels of U and latents without a label, received {int(unsafe.sum())} and {int((code == UNLABELLED).sum())}; raise labels.unsafe, "
-            "or set labels.spread=false"
+            "or set labels.share=1"
         )
     mean, scale = z.mean(0), z.std(0).clamp_min(1e-6)
     loop = InnerLoop(seed)
@@ -173,8 +173,8 @@ def tell_of_others(work: Workspace, number: int) -> None:
     else:
         drawn, region = data["drawn"][:, 0], torch.where(told, data["region"][:, 0], UNLABELLED)
         both = all(bool((region[drawn] == code).any()) for code in (UNSAFE, UNLABELLED))
-        if both and source.labels.used_up(source.budget["labels of U"]):
-            region = infer_unsafe(seen, region, drawn, seed=spawn(work.seed, "spread"))
+        if both:
+            region = infer_unsafe(seen, region, drawn, seed=spawn(work.seed, "inferred labels"))
     data["region"] = region[:, None]
 
 

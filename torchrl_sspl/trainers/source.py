@@ -17,6 +17,7 @@ from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.data.store import continues
 from torchrl_sspl.direction import direction_of
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.simulation import Episodes
 from torchrl_sspl.journal import Entry
 from torchrl_sspl.modules import LatentObserver, Predict
@@ -30,6 +31,7 @@ _ENCODED = 1000  # and that are encoded at a time
 _COUNTED = (
     "transitions", "labels of S", "labels of U", "resets", "transitions of rollouts", "held-out pictures with a label", "held-out steps with a label",
 )  # fmt: skip
+_ANSWERS = {SAFE: "chosen labels of S", UNSAFE: "chosen labels of U", UNLABELLED: "chosen labels of neither"}
 
 Latents = dict[str, Tensor]
 
@@ -111,12 +113,11 @@ class Source:
         return self.env.state_space - self.env.unsafe_set
 
     def count(self, store: TransitionStore) -> None:
-        """Adds what a store holds to the budget."""
-        n, region = len(store), store.region
-        self.budget["transitions"] += n
-        self.budget["labels of S"] += int((region == SAFE).sum())
-        self.budget["labels of U"] += int((region == UNSAFE).sum())
-        self.budget["resets"] += (store.n_frames - n) // 2  # an episode has two frames more than transitions
+        """Adds what was recorded into a store to the budget."""
+        self.budget["transitions"] += store.recorded
+        self.budget["labels of S"] += store.given[SAFE]
+        self.budget["labels of U"] += store.given[UNSAFE]
+        self.budget["resets"] += (store.n_frames - len(store)) // 2  # an episode has two frames more than transitions
         self.tell(self.budget["transitions"])
 
     def count_stored(self) -> None:
@@ -126,7 +127,7 @@ class Source:
 
     def count_labels(self, answers: Tensor) -> None:
         """Adds labels ``(n,)`` that were asked for to the budget, with those that say that a picture is of neither set."""
-        for code, name in ((SAFE, "labels of S"), (UNSAFE, "labels of U"), (UNLABELLED, "labels of neither")):
+        for code, name in _ANSWERS.items():
             self.budget[name] = self.budget.get(name, 0) + int((answers == code).sum())
 
     def count_held_out(self, pictures: int, *runs: Episodes) -> None:
@@ -232,12 +233,21 @@ class Source:
             env.close()
         return {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
 
+    @staticmethod
+    def _check_recorded(store: TransitionStore, asked: Sequence[str]) -> None:
+        if len(store) and (lacking := set(asked) - set(store.get(slice(0, 1)).keys())):
+            raise ConfigError(
+                f"expected a store that was recorded with these labels, received one without {', '.join(sorted(lacking))}; give the same labels to both, "
+                "TransitionStore(capacity, labels=labels), and record it again"
+            )
+
     @torch.no_grad()
     def _encode(self, store: TransitionStore, index: Tensor) -> Latents:
         """Encoded observations before and after, actions and regions of some transitions, on the CPU; which of them go on
         where the one before ends."""
         device = next(self.encoder.parameters()).device
-        parts, asked = [], ["answer"] if self.labels is not None and self.labels.choose else []
+        parts, asked = [], [] if self.labels is None else self.labels.kept
+        self._check_recorded(store, asked)
         for rows in index.split(_ENCODED):
             batch = store.get(rows)
             if hasattr(self.encoder, "sequence"):

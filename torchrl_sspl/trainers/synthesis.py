@@ -88,22 +88,17 @@ class Gather(Phase):
             parts = [] if stored is None else [stored]
             if missing > 0 and (source.known or stored is None):
                 parts.append(source.random(missing, 0))
-            drawn = len(parts)
             if s.grid and source.known and s.rim_transitions:  # what lies between pictures of U has to be known, too
                 parts.append(source.random(s.rim_transitions, 5, region=source.env.unsafe_set, steps=1))
             if work.observing and source.known:
                 parts.append(self._rollouts(work, 15, gain_matrix(1.0, work.latent_dim, work.seen_dim)))
         else:
-            parts, drawn = [work.latents, self._near_the_set(work)], 0
+            parts = [work.latents, self._near_the_set(work)]
             if source.known and s.rim_transitions:
                 parts.append(_rim_of_unsafe(work, 20 * self.number + 10))
-        labels = source.labels
-        if labels is not None and labels.spread:  # later ones are of other places, and their labels used up: how frequent labels are there says nothing of U
-            for k, part in enumerate(parts):
-                part.setdefault("drawn", torch.full_like(part["told"], k < drawn))
         parts = [work.filtered(part) for part in parts]
         work.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
-        if labels is not None and labels.tells:
+        if source.labels is not None and source.labels.tells:
             tell_of_others(work, self.number)
         work.cache.clear()
         unsafe = work.unsafe()
