@@ -146,7 +146,7 @@ def figure(out: Path) -> Path:
 def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callable[[dict[str, Any]], str]) -> None:
     """One mark for each training over ``x``, and lines through the means of those that share a name and a place."""
     names, ticks = sorted({name(row) for row in rows}), set[int]()
-    for colour, label in zip(itertools.cycle(PATH_COLOURS), names):  # noqa: B905 - of colours there are always enough
+    for colour, label in zip(itertools.cycle(PATH_COLOURS), names):
         for measure, mark, style in (("claimed_over_kernel", "o", "-"), ("unsafe_called_safe", "^", "--"), ("false_safe", "s", ":")):
             groups: dict[Any, list[tuple[float, float]]] = {}
             for row in (row for row in rows if name(row) == label and row["measurements"][measure]["value"] is not None):

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from torchrl_sspl.baselines import BUDGETS, ScoreConfig, make, score
+from torchrl_sspl.baselines import BUDGETS, ScoreConfig, make, score, scoring
 from torchrl_sspl.baselines.ceilings import collision_cone
 from torchrl_sspl.baselines.scoring import adversarial, barrier_on, calibrated_level, harmless, well_inside
 from torchrl_sspl.envs import DubinsEnv, GymnasiumPixels, PendulumEnv
@@ -171,6 +171,16 @@ def test_who_claims_nothing_has_an_empty_calibrated_set(pendulum):
     found = score(method, env, ScoreConfig(episodes=20, horizon=3, grid=21, frames=1), kernel=kernel)
     assert found["calibrated_claimed_over_kernel"] == found["claimed_over_kernel"] == 0.0  # it counts in a mean over seeds
     assert found.measurements["calibrated_harmless_enter"].value is None
+
+
+def test_a_claim_too_small_to_place_a_level_by_has_an_empty_calibrated_set(pendulum, monkeypatch):
+    env, kernel = pendulum
+    starts = scoring._Score.starts
+    monkeypatch.setattr(scoring._Score, "starts", lambda it, keep, index, n: starts(it, keep, index, n)[: 0 if index == 2 else n])
+    found = score(fitted("lqr", env), env, ScoreConfig(episodes=20, horizon=3, grid=21, frames=1), kernel=kernel)
+    assert found["claimed_over_kernel"] > 0.0
+    assert found["calibrated_claimed_over_kernel"] == 0.0
+    assert "no episode was found" in found.measurements["calibrated_harmless_enter"].note
 
 
 def test_a_calibrated_level_never_rises_and_may_leave_nothing():

@@ -125,3 +125,13 @@ def test_pictures_of_another_kind_are_refused():
         pooled(torch.zeros(1, 6, 32, 32))
     with pytest.raises(ShapeError, match="n, c, H, W"):
         pooled(torch.zeros(6, 32, 32, dtype=torch.uint8))
+
+
+def test_a_training_on_a_system_without_recommended_settings_is_refused(tmp_path):
+    with pytest.raises(ConfigError, match="sspl: expected env=pendulum or env=dubins, received CMUDubinsEnv"):
+        run_cell(Cell.of("sspl", ["env=cmu", f"out_dir={tmp_path}", *SMALL]))
+
+
+def test_a_discount_that_is_none_is_refused():
+    with pytest.raises(ConfigError, match=r"latent_safe: expected discount in \[0, 1\), received 1.5"):
+        make("latent_safe", ["discount=1.5"]).fit(None, PendulumEnv(), BUDGETS["tiny"], 0)

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import torchrl_sspl
 from torchrl_sspl.baselines import BUDGETS, make
 from torchrl_sspl.baselines.__main__ import main
 from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell, run_cell
@@ -108,6 +114,48 @@ def test_a_signal_ends_the_command_and_what_is_done_stays(words, monkeypatch, ca
     assert "interrupted by SIGTERM; rows and trials that are done stay" in capsys.readouterr().err
 
 
+def test_an_error_of_any_kind_is_named_in_its_row_and_the_others_go_on(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+
+    def run(cell):
+        if cell.method == "cone":
+            raise RuntimeError("no such memory")
+        return run_cell(cell)
+
+    monkeypatch.setattr("torchrl_sspl.baselines.table.run_cell", run)
+    (_, failed), (_, row) = table(["methods=cone,lqr", "env=pendulum", *SMALL])
+    assert failed == "RuntimeError: no such memory"
+    assert row["measurements"]
+    assert "Traceback" in capsys.readouterr().err  # what the library does not name itself can be looked up
+    broken = tmp_path / "runs/baselines/pendulum/none/other/0" / ROW_FILE
+    broken.parent.mkdir(parents=True)
+    broken.write_text("{")
+    assert main(["table", "methods=lqr", "env=pendulum", *SMALL]) == 0
+    assert "left out: 'runs/baselines/pendulum/none/other/0/row.json' cannot be read" in capsys.readouterr().err
+    assert len(json.loads((tmp_path / "runs/baselines/rows.json").read_text())) == 1
+
+
+def test_a_signal_ends_the_processes_too(tmp_path):
+    code = "import sys; from torchrl_sspl.baselines.__main__ import main; sys.exit(main(sys.argv[1:]))"
+    words = ["table", "methods=" + ",".join(f"lqr:alpha=0.{k}" for k in range(1, 10)), "env=pendulum", "jobs=2"]
+    path = os.pathsep.join([str(Path(torchrl_sspl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
+    run = subprocess.Popen([sys.executable, "-c", code, *words, *SMALL[1:], "score.episodes=3000000"], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path},
+                           stderr=subprocess.PIPE, text=True)  # fmt: skip
+    try:
+        begun = time.monotonic()
+        while not list(tmp_path.rglob(".owner.json")):
+            assert time.monotonic() - begun < 240
+            time.sleep(0.05)
+        run.send_signal(signal.SIGTERM)
+        _, told = run.communicate(timeout=60)
+    finally:
+        run.kill()
+    assert run.returncode == 143
+    assert "rows and trials that are done stay" in told
+    assert not list(tmp_path.rglob(".owner.json"))  # none of them goes on
+    assert not list(tmp_path.rglob(ROW_FILE))
+
+
 def test_a_car_is_shown_at_its_middle_heading(tmp_path):
     cell = Cell.of("cone", ["env=dubins", f"out_dir={tmp_path}", "score.grid=9", *SMALL[:2], *SMALL[3:]])
     run_cell(cell)
@@ -149,6 +197,7 @@ def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():
     text = markdown([(cell, "not measured") for cell in asked])
     assert "| sspl agent=pendulum | its own |" in text
     assert "| sspl | small |" in text
+    assert len(cells(["methods=sspl:agent=pendulum", "env=pendulum", "budget=small,full", "seed=0,1"])) == 1
 
 
 @pytest.mark.parametrize(
@@ -158,6 +207,14 @@ def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():
         (["method=lqr"], "expected methods="),
         (["methods=none"], "expected a method"),
         (["methods=latent_cbf", "budget=large"], "expected budget"),
+        (["methods=depth:noise=[0.02,lqr"], "expected options among"),
+        (["methods=latent_safe:actions=0"], "latent_safe: expected actions >= 1, received 0"),
+        (["methods=imitation:rounds=-1"], "imitation: expected rounds >= 1"),
+        (["methods=hocbf:k=.nan"], "hocbf: expected k to be finite, received nan"),
+        (["methods=lqr", "score.grid=[1"], r"expected score\.\* among"),
+        (["methods=lqr", "score.grid=-3"], r"score\.grid: expected >= 2, or 0 for the default, received -3"),
+        (["methods=lqr", "score.check_episodes=-1"], r"score\.check_episodes: expected >= 0, received -1"),
+        (["methods=lqr", "score.frames=0"], r"score\.frames: expected >= 1"),
     ],
 )
 def test_words_that_are_not_valid_are_refused(words, message):

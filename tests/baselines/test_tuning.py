@@ -12,7 +12,7 @@ from torchrl_sspl.baselines.cell import TRIALS_FILE, Cell, run_cell
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.baselines.tuning import SEED, draws, merit, search
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, OutputError
 
 SMALL = ["budget=tiny", "score.episodes=6", "score.horizon=4", "score.grid=11", "score.kernel_grid=31", "score.frames=1", "score.shifted=0"]
 
@@ -70,6 +70,25 @@ def test_the_first_of_the_best_is_chosen():
     assert search(lambda words: -1.0 if not words else 2.0, options)[0] == ("a=1",)
 
 
+def test_options_with_which_nothing_can_be_fitted_are_not_chosen():
+    def trial(words):
+        if words == ("a=1",):
+            raise ConfigError("expected finite losses")
+        return -1.0
+
+    chosen, found = search(trial, [("a=1",), ("a=2",)])
+    assert chosen == ("a=2",)
+    assert found[0]["merit"] is None
+    assert found[0]["error"] == "ConfigError: expected finite losses"
+    assert search(trial, [("a=1",), ("a=2",)], json.loads(json.dumps(found)))[0] == ("a=2",)
+
+
+def test_options_that_name_the_row_are_not_drawn():
+    assert any("form=" in word for words in draws("nerf_cbf", 8) for word in words)
+    assert not any("form=" in word for words in draws("nerf_cbf", 8, named=["form"]) for word in words)
+    assert Cell.of("sspl", ["agent=pendulum", "trials=8"]).trials == 0
+
+
 def test_trials_that_have_been_made_are_not_made_again():
     made, kept = [], []
 
@@ -89,11 +108,12 @@ def test_trials_that_have_been_made_are_not_made_again():
 
 def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(kind_of("nerf_cbf"), "space", {"steps": (3, 5)})
+    monkeypatch.setattr(kind_of("nerf_cbf"), "space", {"beta": (0.5, 1.5), "steps": (900,)})
     words = ["steps=2", "trials=3", *SMALL]
     first = run_cell(Cell.of("nerf_cbf", ["seed=0", *words]))
     assert first["cell"]["trials"] == 3
     assert len(first["tuning"]["trials"]) == 3
+    assert 0.0 < first["minutes"]["trials_cpu"] < 10.0
     assert first["tuning"]["chosen"] in [t["options"] for t in first["tuning"]["trials"]]
     path = tmp_path / "runs/baselines/pendulum/tiny/nerf_cbf-steps-2-trials-3" / TRIALS_FILE
     told = json.loads(path.read_text())
@@ -105,8 +125,11 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
     assert SEED not in (0, 1, 2)
     told["of"]["horizon"] = 7
     path.write_text(json.dumps(told))  # trials of something else
-    monkeypatch.setattr("torchrl_sspl.baselines.tuning.search", lambda *of: (("steps=3",), []))
-    assert run_cell(Cell.of("nerf_cbf", ["seed=2", *words]))["tuning"]["chosen"] == ["steps=3"]
+    monkeypatch.setattr("torchrl_sspl.baselines.tuning.search", lambda *of: (("beta=3.0",), []))
+    assert run_cell(Cell.of("nerf_cbf", ["seed=2", *words]))["tuning"]["chosen"] == ["beta=3.0"]
+    path.write_text("{")
+    with pytest.raises(OutputError, match=r"trials in '.*', received what cannot be read"):
+        run_cell(Cell.of("nerf_cbf", ["seed=3", *words]))
     with pytest.raises(ConfigError, match=f"another seed than {SEED}"):
         Cell.of("nerf_cbf", [f"seed={SEED}", "trials=3"])
     with pytest.raises(ConfigError, match="expected trials to be an integer"):

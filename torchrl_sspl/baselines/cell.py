@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
+from filelock import FileLock
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -90,11 +92,12 @@ class Cell:
             raise ConfigError(f"expected another seed than {tuning.SEED} with trials, which are made with that one, received it")
         try:
             sizes: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ScoreConfig), OmegaConf.from_dotlist(scores)))
-        except OmegaConfBaseException as error:
+        except (OmegaConfBaseException, yaml.YAMLError) as error:
             valid = ", ".join(OmegaConf.structured(ScoreConfig))
             raise ConfigError(f"expected score.* among {valid}, received {scores} ({' '.join(str(error).split())})") from error
+        sizes.check()
         budget = own.get("budget", "small") if kind.learns else "none"
-        trials = int(own.get("trials", 0)) if kind.learns else 0
+        trials = int(own.get("trials", 0)) if kind.learns and not trained_before(options) else 0
         return cls(method, own.get("env", "pendulum"), budget, int(own.get("seed", 0)), options, sizes, own.get("out_dir", ""), trials)
 
     @property
@@ -120,6 +123,16 @@ class Cell:
         if not isinstance(env, SafetyEnv) or env.known_twin() is not env:
             raise ConfigError(f"env: expected a system whose true kernel is known, such as pendulum or dubins, received '{self.env}'")
         return env
+
+
+def trained_before(options: Sequence[str]) -> bool:
+    """Whether options give an agent that is scored as it is. Source: none.
+
+    Example:
+        >>> trained_before(["agent=pendulum"]), trained_before(["filter=true"])
+        (True, False)
+    """
+    return any(option.startswith("agent=") for option in options)
 
 
 def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
@@ -180,9 +193,8 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
     asked = {
         "method": cell.method, "env": cell.env, "budget": cell.budget, "options": list(cell.options), "trials": cell.trials, "horizon": horizon,
     }  # fmt: skip
-    options, told = tuning.draws(cell.method, cell.trials), []
-    if path.is_file() and (found := json.loads(path.read_text())).get("of") == asked:
-        told = found["trials"]
+    # An option that names the row is not drawn.
+    options = tuning.draws(cell.method, cell.trials, named=[option.partition("=")[0] for option in cell.options])
     env, stages = replace(cell, seed=tuning.SEED).environment(), dict[tuple[str, ...], Any]()
 
     def trial(words: Sequence[str]) -> float:
@@ -192,14 +204,27 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
             _fit(method, env, cell, tuning.SEED)
             return tuning.merit(method, env, horizon=horizon)
 
-    return tuning.search(trial, options, told, lambda so_far: write(path, json.dumps({"of": asked, "trials": so_far}, indent=1) + "\n"))
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with FileLock(path.with_name(f".{TRIALS_FILE}.lock")):  # another seed waits for them
+        return tuning.search(trial, options, _told(path, asked), lambda so_far: write(path, json.dumps({"of": asked, "trials": so_far}, indent=1) + "\n"))
+
+
+def _told(path: Path, asked: dict[str, Any]) -> list[dict[str, Any]]:
+    """The trials that an earlier call has made."""
+    if not path.is_file():
+        return []
+    try:
+        found = json.loads(path.read_text())
+    except ValueError as error:
+        raise OutputError(f"expected trials in '{path}', received what cannot be read: {error}; remove it") from error
+    return found["trials"] if found.get("of") == asked else []
 
 
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Record, fit, score, write; or read what an earlier call has written.
 
-    Returns the row: ``cell``, ``needs``, ``minutes`` (``data``, ``fit`` of wall clock, ``fit_cpu`` of the processor, ``score``) and
-    ``measurements``. Raises ConfigError for a cell that is not valid, OutputError if another row lies there or another
+    Returns the row: ``cell``, ``needs``, ``minutes`` (``data``, ``fit`` of wall clock, ``fit_cpu`` of the processor, ``trials_cpu`` of all trials,
+    ``score``) and ``measurements``. Raises ConfigError for a cell that is not valid, OutputError if another row lies there or another
     process is writing it. Source: none.
 
     Example:
@@ -229,7 +254,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         minutes = {name: (b - a) / 60 for name, a, b in zip(("data", "fit", "score"), clock, clock[1:], strict=False)}
         row = {
             "schema": SCHEMA, "version": __version__, "cell": cell.describe(), "needs": asdict(method.needs),
-            "minutes": minutes | {"fit_cpu": used / 60}, "measurements": found.to_dict(), "notes": method.notes,
+            "minutes": minutes | {"fit_cpu": used / 60} | _of_trials(trials), "measurements": found.to_dict(), "notes": method.notes,
         }  # fmt: skip
         if cell.trials:
             row["tuning"] = {"chosen": list(chosen), "trials": trials}
@@ -241,6 +266,11 @@ def run_cell(cell: Cell) -> dict[str, Any]:
             write(directory / CLAIMS_FILE, packed.getvalue())
         write(directory / ROW_FILE, json.dumps(row, indent=1) + "\n")
         return row
+
+
+def _of_trials(trials: Sequence[dict[str, Any]]) -> dict[str, float]:
+    """What trials took of the processor, where each says so."""
+    return {"trials_cpu": sum(trial["cpu"] for trial in trials) / 60} if trials and all("cpu" in trial for trial in trials) else {}
 
 
 def text(row: dict[str, Any]) -> str:

@@ -22,6 +22,7 @@ from torchrl_sspl.baselines.base import Budget, Needs, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, pooled
 from torchrl_sspl.baselines.perception import encoder_for, train
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics
 from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.objectives import SaLaDLoss
@@ -62,6 +63,8 @@ class LatentSafe(SafetyMethod):
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """World model, margin, value, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
+        if not 0.0 <= c.discount < 1.0:
+            raise ConfigError(f"{self.name}: expected discount in [0, 1), received {c.discount}")
         self.env = env
         failed = data.region == UNSAFE
         region = torch.where(failed, UNSAFE, SAFE)

@@ -38,7 +38,12 @@ def main(words: Sequence[str]) -> int:
     text = markdown(rows)
     print(text)
     write(DIRECTORY / "table.md", text)
-    every = [json.loads(path.read_text()) for path in sorted(DIRECTORY.rglob(ROW_FILE))]
+    every = []
+    for path in sorted(DIRECTORY.rglob(ROW_FILE)):
+        try:
+            every.append(json.loads(path.read_text()))
+        except ValueError as error:
+            print(f"left out: '{path}' cannot be read ({error}); remove it", file=sys.stderr)
     write(DIRECTORY / "rows.json", json.dumps(every, indent=1) + "\n")
     try:
         page(rows, DIRECTORY / "table.html")

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Sequence
 
+import yaml
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -59,10 +61,14 @@ def make(name: str, options: Sequence[str] = ()) -> SafetyMethod:
         return kind()
     try:
         merged = OmegaConf.merge(OmegaConf.structured(kind.Config), OmegaConf.from_dotlist(list(options)))
-        return kind(OmegaConf.to_object(merged))
-    except OmegaConfBaseException as error:
+    except (OmegaConfBaseException, yaml.YAMLError) as error:
         valid = ", ".join(OmegaConf.structured(kind.Config))
         raise ConfigError(f"{name}: expected options among {valid}, received {list(options)} ({' '.join(str(error).split())})") from error
+    for key, usual in vars(kind.Config()).items():
+        value, least = merged[key], min(1, usual) if type(usual) is int else -math.inf
+        if isinstance(value, (int, float)) and not least <= value < math.inf:
+            raise ConfigError(f"{name}: expected {key} {f'>= {least}' if type(usual) is int else 'to be finite'}, received {value}")
+    return kind(OmegaConf.to_object(merged))
 
 
 __all__ = ["METHODS", "kind_of", "make"]

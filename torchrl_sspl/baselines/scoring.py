@@ -41,6 +41,13 @@ class ScoreConfig:
     shifted: int = 1000  # uniform states that are shown on shifted pictures of each kind; 0: none
     seed: int = 20260104  # of the starts
 
+    def check(self) -> None:
+        """Raises ConfigError for a size with which nothing can be measured."""
+        for name, value in vars(self).items():
+            least = 1 if name == "frames" else 2 if name in ("grid", "kernel_grid") and value else 0
+            if not value >= least:
+                raise ConfigError(f"score.{name}: expected >= {least}{', or 0 for the default' if least == 2 else ''}, received {value}")
+
 
 def harmless(env: SafetyEnv) -> Nominal:
     """A nominal policy that does nothing: states ``(n, s)`` -> zeros ``(n, m)``. Source: none.
@@ -194,15 +201,13 @@ def score(
         0.0
     """
     given = config or ScoreConfig()
+    given.check()
     on_states = method.reads == "state"
     episodes = given.episodes or (10_000 if on_states else 500)
     sizes = ScoreConfig(
         episodes, given.horizon or (200 if on_states else 100), given.grid, given.kernel_grid,
         given.check_episodes or episodes, given.frames, given.shifted, given.seed,
     )  # fmt: skip
-    for name in ("episodes", "horizon", "frames"):
-        if getattr(sizes, name) < 1:
-            raise ConfigError(f"score.{name}: expected at least 1, received {getattr(sizes, name)}; 0 in the configuration: the default")
     if kernel is None:
         kernel = viability_kernel(env, resolution=sizes_of(env.system.kernel_grid, given.kernel_grid))
     it = _Score(method, env, kernel, sizes, Evaluation(), album or Album(env))
@@ -296,6 +301,10 @@ def _calibrated(it: _Score, sets: tuple[Tensor, Tensor, Tensor], found: list[tup
         it.out.missing(*names, note="nothing is claimed")
         return
     check = it.starts(it.inside, 2, it.config.check_episodes)
+    if not len(check):  # starts were found, and now there are none: a handful of states
+        _count_sets(it.out, "calibrated_", torch.zeros_like(sets[1]), *sets[1:])
+        it.out.missing(*names, note="so little is claimed that no episode was found to place a level by")
+        return
     half = check[: len(check) // 2], check[len(check) // 2 :]
     both = [(x, it.episodes(x, make(it.env))[1]) for x, make in zip(half, (harmless, adversarial), strict=True) if len(x)]
     value = it.barrier(torch.cat([x for x, _ in both]))

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchrl_sspl.baselines.base import Budget, Guarded, Needs, Nominal, SafetyMethod
 from torchrl_sspl.configs.reader import compose
+from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.envs.base import SafetyEnv
-from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.controllers import AgentController, Camera
 from torchrl_sspl.experiments.run import Experiment
@@ -124,8 +124,11 @@ class SSPL(SafetyMethod):
     def _train(self, env: SafetyEnv, budget: Budget, seed: int) -> tuple[Agent, dict[str, int]]:
         if self.directory is None:
             raise ConfigError("sspl: expected a directory for the training, received none; run it as a cell")
+        system = {PendulumEnv: "pendulum", DubinsEnv: "dubins"}.get(type(env))
+        if system is None:
+            raise ConfigError(f"sspl: expected env=pendulum or env=dubins, received {type(env).__name__}; of other systems give agent=, a run of 'sspl train'")
         plan = ["logger=none", "trainer.progress=false", "evaluation.calibrate=true", f"seed={seed}", f"out_dir={self.directory / 'run'}"]
-        plan = [*settings("pendulum" if isinstance(env, PixelPendulumEnv) else "dubins", budget), *plan]
+        plan = [*settings(system, budget), *plan]
         experiment = Experiment(compose([*plan, *self.config.overrides]))
         agent = experiment.train().cpu()
         self.checks = experiment.work.checks

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import itertools
+import os
 import sys
-from collections.abc import Iterable, Sequence
+import traceback
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
 from typing import Any
 
-from torchrl_sspl.baselines.cell import STAYS, Cell, run_cell, stored
+from torchrl_sspl.baselines.cell import STAYS, Cell, run_cell, stored, trained_before
 from torchrl_sspl.baselines.registry import kind_of
 from torchrl_sspl.configs.reader import parse
 from torchrl_sspl.errors import ConfigError, SSPLError
-from torchrl_sspl.interrupts import interruptible
+from torchrl_sspl.interrupts import Interrupted, interruptible
 
 Row = dict[str, Any] | str  # what was measured, or why nothing was
 
@@ -85,8 +87,10 @@ def cells(words: Sequence[str]) -> list[Cell]:
         # Those of one recording one after the other: it is made once.
         for budget, seed, name in itertools.product(given.get("budget", "small").split(","), given.get("seed", "0").split(","), names):
             method, *options = name.split(":")
-            if not kind_of(method).learns or any(o.startswith("agent=") for o in options):
+            if not kind_of(method).learns or trained_before(options):
                 seed = "0"
+            if trained_before(options):
+                budget = "small"  # a name alone: nothing is learnt with it
             cell = Cell.of(method, [f"env={env}", f"budget={budget}", f"seed={seed}", f"trials={given.get('trials', '0')}", *options, *scores])
             found[cell.directory] = cell
     return list(found.values())
@@ -114,14 +118,28 @@ def table(words: Sequence[str]) -> list[tuple[Cell, Row]]:
     if run not in ("true", "false") or not jobs.isdigit() or not int(jobs):
         raise ConfigError(f"table: expected run=true or false and jobs >= 1, received run={run} and jobs={jobs}")
     asked, measure, found = cells([f"{k}={v}" for k, v in given.items()]), partial(_row, run=run == "true"), list[tuple[Cell, Row]]()
-    with ExitStack() as stack:
-        rows: Iterable[Row] = map(measure, asked)
-        if run == "true" and int(jobs) > 1:
-            rows = stack.enter_context(ProcessPoolExecutor(int(jobs), get_context("spawn"))).map(measure, asked)
-        for cell, row in zip(asked, rows, strict=True):
-            found.append((cell, row))
-            print(f"{len(found)} of {len(asked)}: {cell.directory}", file=sys.stderr, flush=True)
+    rows = _side_by_side(measure, asked, int(jobs)) if run == "true" and int(jobs) > 1 else map(measure, asked)
+    for cell, row in zip(asked, rows, strict=True):
+        found.append((cell, row))
+        print(f"{len(found)} of {len(asked)}: {cell.directory}", file=sys.stderr, flush=True)
     return found
+
+
+def _side_by_side(measure: Callable[[Cell], Row], asked: Sequence[Cell], jobs: int) -> Iterator[Row]:
+    """The rows in order, measured by as many processes; whatever ends this one ends them, too."""
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"))
+    try:
+        for row in [pool.submit(measure, cell) for cell in asked]:
+            try:
+                yield row.result()
+            except BrokenProcessPool as error:
+                yield f"BrokenProcessPool: {error} It may have wanted more memory: the same command goes on, with jobs=1 each cell has all of it"
+    except BaseException:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in active_children():
+            child.terminate()
+        raise
+    pool.shutdown()
 
 
 def _row(cell: Cell, *, run: bool) -> Row:
@@ -129,7 +147,13 @@ def _row(cell: Cell, *, run: bool) -> Row:
     try:
         with interruptible(lambda: STAYS):  # here, too: it may be another process
             return run_cell(cell) if run else stored(cell, any_score=True) or "not measured"
-    except SSPLError as error:
+    except Interrupted as error:
+        if parent_process() is not None:
+            os._exit(128 + error.number)  # else this process would begin the next cell
+        raise
+    except Exception as error:  # whatever becomes of one method, the others are measured
+        if not isinstance(error, SSPLError):
+            traceback.print_exc()
         return f"{type(error).__name__}: {error}"
 
 
@@ -158,10 +182,12 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
                 shifted.append([label, budget, *(" / ".join(_value(good, _moved(c, shift)) for c in _MEASURED[:3]) for shift in _SHIFTS)])
             facts = ["not counted" if (n := first["needs"].get(key)) is None else str(n) for _, key in _NEEDED]
-            minutes = sum(row["minutes"]["fit_cpu"] for row in good) / len(good)
+            minutes = f"{sum(row['minutes']['fit_cpu'] for row in good) / len(good):.1f}"
+            if "trials_cpu" in first["minutes"]:
+                minutes += f", and {first['minutes']['trials_cpu']:.1f} of trials"
             ticks = TICKS.get(first["cell"]["method"], "")
             rests = [" or ".join(dict.fromkeys(row["needs"][name] for row in good)) for name in ("proved", "measured", "claimed")]
-            given.append([label, budget, *facts, f"{minutes:.1f}", *rests, " ".join("✓" if t == "+" else "✗" for t in ticks) or "-"])
+            given.append([label, budget, *facts, minutes, *rests, " ".join("✓" if t == "+" else "✗" for t in ticks) or "-"])
         every[env] = [("Measured", lines), ("Given", given)]
         if len(shifted) > 1:
             every[env].append(("Shifted pictures: claimed / kernel, false-safe, U called safe", shifted))
@@ -175,7 +201,7 @@ def name_of(cell: Cell) -> str:
 
 def budget_of(cell: Cell) -> str:
     """The budget of a cell; an agent that was trained before has one of its own. Source: none."""
-    return "its own" if any(option.startswith("agent=") for option in cell.options) else cell.budget
+    return "its own" if trained_before(cell.options) else cell.budget
 
 
 def markdown(rows: Sequence[tuple[Cell, Row]]) -> str:

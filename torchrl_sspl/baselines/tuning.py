@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import random
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,16 +14,17 @@ from torchrl_sspl.baselines.base import SafetyMethod
 from torchrl_sspl.baselines.registry import kind_of
 from torchrl_sspl.baselines.scoring import NOMINALS, adversarial, barrier_on, harmless, paths
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import SSPLError
 
 SEED = 100  # of recording, weights and starts of the trials; scored seeds are others
-Trial = dict[str, Any]  # the options, and what they were worth
+Trial = dict[str, Any]  # the options, what they were worth (None: the fit failed, and why), and s of the processor
 LOST = 10.0  # an episode from the claimed set that enters U costs as much as so many that do not are worth
 
 
-def draws(method: str, trials: int, seed: int = SEED) -> list[tuple[str, ...]]:
+def draws(method: str, trials: int, seed: int = SEED, *, named: Sequence[str] = ()) -> list[tuple[str, ...]]:
     """``key=value`` options of each trial: the defaults first, then random draws from the method's ``space``, none drawn twice.
 
-    A draw may be the defaults, written out. A space with fewer points than trials gives fewer trials.
+    A draw may be the defaults, written out; options that are ``named`` are not drawn. A space with fewer points than trials gives fewer trials.
 
     Source: none.
 
@@ -29,7 +32,7 @@ def draws(method: str, trials: int, seed: int = SEED) -> list[tuple[str, ...]]:
         >>> draws("imitation", 3)[0], len(draws("imitation", 8))
         ((), 4)
     """
-    space, generator = kind_of(method).space, random.Random(seed)
+    space, generator = {k: v for k, v in kind_of(method).space.items() if k not in named}, random.Random(seed)
     found: list[tuple[str, ...]] = [()]
     for _ in range(100 * trials):
         if len(found) >= trials:
@@ -85,14 +88,21 @@ def search(
         keep: is given all trials so far after each of them.
 
     Example:
-        >>> search(lambda words: float(len(words)), [(), ("a=1",)])
-        (('a=1',), [{'options': [], 'merit': 0.0}, {'options': ['a=1'], 'merit': 1.0}])
+        >>> chosen, trials = search(lambda words: float(len(words)), [(), ("a=1",)])
+        >>> chosen, [trial["merit"] for trial in trials]
+        (('a=1',), [0.0, 1.0])
     """
     found = [*told]
     for words in options[len(found) :]:
-        found.append({"options": list(words), "merit": trial(words)})
+        made: Trial = {"options": list(words), "merit": None}
+        begun = time.process_time()
+        try:
+            made["merit"] = trial(words)
+        except SSPLError as error:  # options with which nothing can be fitted are not chosen
+            made["error"] = f"{type(error).__name__}: {error}"
+        found.append(made | {"cpu": time.process_time() - begun})
         keep(found)
-    best = max(range(len(found)), key=lambda k: (found[k]["merit"], -k))
+    best = max(range(len(found)), key=lambda k: (-math.inf if found[k]["merit"] is None else found[k]["merit"], -k))
     return options[best], found
 
 
