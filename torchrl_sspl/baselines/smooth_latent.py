@@ -40,8 +40,9 @@ class SmoothLatent(LatentSafe):
 
     name = "smooth_latent"
     Config: ClassVar[type | None] = SmoothLatentConfig
+    # With a slope of 0.1 the margin reaches about 0.1, and no value is larger.
     space: ClassVar[dict[str, tuple[Any, ...]]] = {
-        "world_steps": (2000, 6000), "discount": (0.98, 0.995, 0.999), "threshold": (0.0, 0.1, 0.2), "keep": (0.5, 0.8, 0.9, 0.95),
+        "world_steps": (2000, 6000), "discount": (0.98, 0.995, 0.999), "threshold": (0.0, 0.01, 0.02, 0.05), "keep": (0.5, 0.8, 0.9, 0.95),
     }  # fmt: skip
 
     def margin_loss(self, good: Tensor, bad: Tensor) -> dict[str, Tensor]:
