@@ -7,7 +7,7 @@ Run: python benchmarks/few_labels.py [env=pendulum] [labels=100,300,1000,all] [t
 Every point is a training of its own, one round without rollouts with the settings of the table's small budget
 (``torchrl_sspl.baselines.sspl.settings`` says where these differ from the recommended ones); a point that has been measured is read.
 Of ``transitions``, recorded under random actions with 15 % of the episodes starting in S and 25 % in U, at most ``labels`` of each
-kind are labelled, those that come first (with ``labels.share=0.1`` each with that chance); the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
+kind are labelled, those that come first (with ``labels.share=0.1`` each with that chance, until there are as many); the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
 ``collector.max_frames_per_traj=1`` records nothing without a label. The level of the set is placed by held-out episodes with labels of their
 own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``; ``figure`` draws all points that there are,
 over the number of labels and over that of the transitions, in ``few_labels.png``.
