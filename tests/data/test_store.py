@@ -218,6 +218,59 @@ def test_a_state_dict_goes_into_a_larger_store_and_not_into_a_smaller_one():
         TransitionStore(5).load_state_dict(store.state_dict())
 
 
+@pytest.mark.parametrize("through", ["store", "buffer", "files"])
+def test_what_a_full_store_held_stays_in_a_larger_one(through, tmp_path):
+    full = TransitionStore(10)
+    full.extend(episode(14))  # steps 4 to 13 are left, of which 10 to 13 lie in front
+    larger = TransitionStore(20)
+    buffer = larger.replay_buffer(4)
+    if through == "files":
+        full.dumps(tmp_path)
+        larger.loads(tmp_path)
+    elif through == "buffer":
+        other = full.replay_buffer(4)
+        buffer.load_state_dict(other.state_dict())
+    else:
+        larger.load_state_dict(full.state_dict())
+    held = larger.get(slice(None))
+    assert held["action"].flatten().tolist() == list(range(4, 14))
+    (larger if through == "store" else buffer).extend(episode(5, seed=1))
+    assert len(larger) == 15
+    assert (larger.get(slice(0, 10)) == held).all()
+    assert larger.get(slice(10, 15))["action"].flatten().tolist() == list(range(5))
+
+
+def test_a_buffer_writes_behind_what_came_into_the_store_otherwise():
+    store = TransitionStore(20)
+    buffer = store.replay_buffer(64, sampler=PrioritizedSampler(20, alpha=1.0, beta=1.0))
+    store.extend(episode(6))
+    buffer.extend(episode(4, seed=1))
+    assert store.get(slice(None))["action"].flatten().tolist() == [*range(6), *range(4)]
+    torch.manual_seed(0)
+    assert set(buffer.sample()["index"].flatten().tolist()) == set(range(10))  # all of them can be drawn
+
+
+def test_what_trajectories_are_filled_up_with_is_not_stored():
+    data = torch.stack([episode(5), episode(5, seed=1)])
+    mask = torch.ones(2, 5, dtype=torch.bool)
+    mask[1, 3:] = False
+    data["collector", "mask"] = mask
+    store = TransitionStore(20)
+    assert len(store.extend(data)) == 8
+    assert store.get(slice(None))["action"].flatten().tolist() == [*range(5), *range(3)]
+
+
+def test_actions_of_a_user_come_out_again():
+    data = episode(4).set("user_action", torch.rand(4, 1)).set("residual", torch.rand(4, 3))
+    store = TransitionStore(8)
+    store.extend(data)
+    out = store.get(slice(None))
+    assert torch.equal(out["user_action"], data["user_action"])
+    assert torch.equal(out["residual"], data["residual"])
+    with pytest.raises(ShapeError, match="expected 'user_action', as in the transitions that it holds"):
+        store.extend(episode(4))
+
+
 def test_unreadable_files_are_named(tmp_path):
     with pytest.raises(CheckpointError, match="cannot read"):
         TransitionStore.from_folder(tmp_path / "nowhere")

@@ -208,6 +208,9 @@ def collect_rollouts(
                 source.set_seed(seed)
             missing = n
             for data in source:
+                mask = data.get(("collector", "mask"), None)
+                if mask is not None:  # split_trajs: what trajectories are filled up with does not count
+                    data = data[mask.reshape(data.batch_size)]
                 # Environments last, so that a last batch that is larger than needed is cut in time.
                 rows = data[..., : -(-missing * data.shape[-1] // data.numel())].reshape(-1)[:missing]
                 store.extend(rows)

@@ -20,7 +20,20 @@ from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 _FILE = "transitions.safetensors"
 _BLOCK = 32768  # frames per block of the bank, at most
+_GIVEN = ("user_action", "residual")  # that a batch may have
 _NAMES = {UNLABELLED: "unlabelled", SAFE: "safe", UNSAFE: "unsafe"}
+
+
+class _Behind(RoundRobinWriter):
+    """Writes behind what the store holds, however that came in."""
+
+    def add(self, data: Any) -> Any:
+        self._cursor = self._storage._cursor
+        return super().add(data)
+
+    def extend(self, data: Any) -> Any:
+        self._cursor = self._storage._cursor
+        return super().extend(data)
 
 
 class TransitionStore(Storage):
@@ -34,7 +47,7 @@ class TransitionStore(Storage):
     make room.
 
     What is read from a tensordict that is written: ``"pixels"`` and ``("next", "pixels")`` uint8 ``(n, 6, H, W)``,
-    ``"action"``, ``"region"``, and where present ``("next", "region")``, ``("next", "terminated")`` and, with
+    ``"action"``, ``"region"``, and where present ``("next", "region")``, ``("next", "terminated")``, ``"user_action"``, ``"residual"`` and, with
     ``keep_state``, ``"state"`` and ``("next", "state")``. What comes out: ``"frames"`` uint8 ``(n, 3, 3, H, W)`` (time,
     RGB, height, width), ``"action"``, ``"region"`` int64 ``(n, 1)``, ``("next", "region")``, ``("next",
     "terminated")``; with ``pixel_views`` also ``"pixels"`` and ``("next", "pixels")``, which share the memory of
@@ -117,9 +130,13 @@ class TransitionStore(Storage):
 
     def extend(self, data: TensorDictBase) -> Tensor:
         """Add transitions ``(*batch,)``, time last; the oldest make room. Returns positions."""
-        data = data.reshape(-1)
+        mask = data.get(("collector", "mask"), None)
+        # What TorchRL fills trajectories of unequal length up with are no transitions.
+        data = data.reshape(-1) if mask is None else data[mask.reshape(data.batch_size)]
         index = (self._cursor + torch.arange(data.shape[0])) % self.max_size
         self.set(index, data)
+        for sampler in self._attached_entities:
+            sampler.mark_update(index)
         return index
 
     def set(self, cursor: Any, data: TensorDictBase, *, set_cursor: bool = True) -> None:
@@ -187,6 +204,12 @@ class TransitionStore(Storage):
             raise ShapeError("store: expected 'action' and 'region', found not both.")
         rows = {"action": action.reshape(n, -1), "region": region.reshape(n, 1)}
         rows["next_region"] = data.get(("next", "region"), torch.zeros_like(region)).reshape(n, 1)
+        for name in _GIVEN:
+            value = data.get(name, None)
+            if value is not None:
+                rows[name] = value.reshape(n, -1)
+            elif name in self._columns:
+                raise ShapeError(f"store: expected {name!r}, as in the transitions that it holds, found none.")
         ended = data.get(("next", "terminated"), None)
         rows["terminated"] = torch.zeros(n, 1, dtype=torch.bool) if ended is None else ended.reshape(n, 1)
         if self.keep_state:
@@ -212,7 +235,7 @@ class TransitionStore(Storage):
         )
         if self.pixel_views:
             out["pixels"], out["next", "pixels"] = frames[:, :2].flatten(1, 2), frames[:, 1:].flatten(1, 2)
-        out.update({name: values for name, values in column.items() if name in ("answer", "drawn")})
+        out.update({name: values for name, values in column.items() if name in (*_GIVEN, "answer", "drawn")})
         if self.keep_state:
             out["info"] = TensorDict(
                 {"state": column["state"], "next_state": column["next_state"]}, batch_size=[rows.numel()]
@@ -236,10 +259,8 @@ class TransitionStore(Storage):
         Further arguments are those of ``TensorDictReplayBuffer``, such as ``prefetch`` or ``generator``; a ``sampler`` of
         TorchRL, such as ``PrioritizedSampler``, takes the place of the stratified one.
         """
-        buffer = {"sampler": RegionSampler(safe, unsafe), "writer": RoundRobinWriter(), "collate_fn": _as_it_is, **buffer}
-        made = TensorDictReplayBuffer(storage=self, batch_size=batch_size, **buffer)
-        made.writer._cursor = self._cursor  # go on behind what the store holds already
-        return made
+        buffer = {"sampler": RegionSampler(safe, unsafe), "writer": _Behind(), "collate_fn": _as_it_is, **buffer}
+        return TensorDictReplayBuffer(storage=self, batch_size=batch_size, **buffer)
 
     def state_dict(self) -> dict[str, Any]:
         """All transitions and frames as tensors, frames without gaps; see ``load_state_dict``."""
@@ -264,6 +285,9 @@ class TransitionStore(Storage):
         self._empty()
         self.keep_state = meta["keep_state"]
         self._len, self._cursor = meta["len"], meta["cursor"] % self.max_size
+        if self._len < self.max_size and meta["cursor"] < self._len:  # that one was full, this one is not: the oldest come first
+            state_dict = {k: v if k in ("_meta", "frames") else v.roll(-meta["cursor"], 0) for k, v in state_dict.items()}
+            self._cursor = self._len
         if self._len:
             slots = self._bank.reserve(state_dict["frames"].shape[0], state_dict["frames"].shape[2:])
             self._bank.write(slots, state_dict["frames"])

@@ -14,7 +14,7 @@ from torchrl.envs import TensorDictPrimer
 
 from torchrl_sspl.direction import Direction, direction_of, within
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.modules.salad import as_tensordict_module
+from torchrl_sspl.modules.salad import as_tensordict_module, written
 
 
 def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int, seen_dim: int | None = None) -> Tensor:
@@ -166,7 +166,7 @@ class LatentObserver(TensorDictModuleBase):
         self.latent_dim = latent_dim
         self.register_buffer("gain", gain_matrix(gain, latent_dim))
         self.in_keys = [*self.encoder.in_keys, "prior", "is_init"]
-        self.out_keys = [*self.encoder.out_keys[:1], "innovation"]
+        self.out_keys = [written(self.encoder, "latent"), "innovation"]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the latent and ``"innovation"``, both ``(*batch, p)``; where an episode begins there is none."""
@@ -204,7 +204,7 @@ class Predict(TensorDictModuleBase):
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``("next", "prior")`` ``(*batch, p)``."""
-        after = self.dynamics(tensordict.select(*self.in_keys))[self.dynamics.out_keys[0]]
+        after = self.dynamics(tensordict.select(*self.in_keys))[written(self.dynamics, ("next", "latent"))]
         return tensordict.set(("next", "prior"), after)
 
 

@@ -36,12 +36,34 @@ def as_tensordict_module(
         )
     if not isinstance(module, TensorDictModuleBase):
         return TensorDictModule(module, in_keys=list(in_keys), out_keys=list(out_keys))
-    if len(module.in_keys) != len(in_keys) or len(module.out_keys) < len(out_keys):
+    swapped = set(module.in_keys) == set(in_keys) and list(module.in_keys) != list(in_keys)
+    if len(module.in_keys) != len(in_keys) or len(module.out_keys) < len(out_keys) or swapped:
         raise ConfigError(
-            f"expected a module with keys like {list(in_keys)} -> {list(out_keys)}, received "
+            f"expected a module with keys like {list(in_keys)} -> {list(out_keys)}, in this order, received "
             f"{list(module.in_keys)} -> {list(module.out_keys)}"
         )
+    for key in out_keys:
+        written(module, key)
     return module
+
+
+def written(module: TensorDictModuleBase, key: NestedKey) -> NestedKey:
+    """Which of its entries a TensorDict module gives for a key: that key, or the only one that it writes.
+
+    Raises ConfigError if it writes several entries and none of that name. Source: none.
+
+    Example:
+        >>> written(TensorDictModule(nn.Linear(2, 1), ["z"], ["b"]), "barrier")
+        'b'
+    """
+    if key in module.out_keys:
+        return key
+    if len(module.out_keys) == 1:
+        return module.out_keys[0]
+    raise ConfigError(
+        f"expected a module that writes {key!r}, or one entry alone, received one that writes {list(module.out_keys)}; give what is meant that "
+        "name, or select it (selected_out_keys)"
+    )
 
 
 class SaLaD(TensorDictSequential):
@@ -139,5 +161,5 @@ def make_rollout_policy(encoder: nn.Module, policy: nn.Module) -> TensorDictSequ
     """
     network = encoder.encoder if isinstance(encoder, SaLaD) else encoder
     encode = as_tensordict_module(network, ["pixels"], ["latent"])
-    act = as_tensordict_module(policy, encode.out_keys[:1], ["action"])
+    act = as_tensordict_module(policy, [written(encode, "latent")], ["action"])
     return TensorDictSequential(encode, act, selected_out_keys=list(act.out_keys))

@@ -17,7 +17,7 @@ from torch.compiler import is_compiling
 from torchrl.objectives import LossModule
 
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
-from torchrl_sspl.modules import as_tensordict_module
+from torchrl_sspl.modules.salad import as_tensordict_module, written
 
 _REDUCTIONS = ("none", "mean", "sum")
 _ABSENT: Any = None
@@ -88,16 +88,21 @@ def _forget(loss: Any, *_: Any) -> None:
     loss._erase_cache()
 
 
-def _called(network: Any, inputs: tuple[Tensor, ...], method: str | None, action: NestedKey) -> Tensor:
-    """What a network gives, of several things the action."""
+def _called(network: Any, inputs: tuple[Tensor, ...], method: str | None, key: NestedKey) -> Tensor:
+    """What a network gives, of several things the one with a key."""
     if method is not None:
         return getattr(network.module, method)(*inputs)
-    if type(network) is TensorDictModule:
-        return network.module(*inputs)
-    output = network(*inputs)
+    output = network.module(*inputs) if type(network) is TensorDictModule else network(*inputs)
     if isinstance(output, tuple):
-        output = output[network.out_keys.index(action) if action in network.out_keys else 0]
+        output = output[network.out_keys.index(key)]
     return output
+
+
+def _check_barrier(value: Tensor, latent: Tensor) -> None:
+    if value.shape != (*latent.shape[:-1], 1):
+        raise ShapeError(
+            f"expected a barrier with one value for each latent, {(*latent.shape[:-1], 1)}, received {tuple(value.shape)}; let it keep its last dimension of size 1"
+        )
 
 
 @lru_cache(maxsize=64)
@@ -192,8 +197,9 @@ class LatentLoss(LossModule):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
-    _schedulable_buffers = frozenset({"safety_margin", "dynamics_margin"})
+    _schedulable_buffers = frozenset({"safety_margin", "dynamics_margin", "worst_coeff"})
     _reads: tuple[str, ...] = ()  # further keys
+    _optional: frozenset[str] = frozenset({"worst_coeff"})  # weights whose terms are not computed where they are zero at first
 
     encoder: TensorDictModuleBase | None
     encoder_params: TensorDictParams
@@ -235,6 +241,7 @@ class LatentLoss(LossModule):
         self.register_load_state_dict_post_hook(_forget)
         self._in_keys: list[NestedKey] | None = None
         self._networks_used: list[str] = []
+        self._written: dict[str, NestedKey] = {}  # of which entry of a network is meant
         self._needs: set[str] = set()
         self._active: set[str] = set()
         self.out_keys: list[str] = []
@@ -265,6 +272,15 @@ class LatentLoss(LossModule):
             # TorchRL's trainers and weight synchronisation look for this name.
             self._add("actor_network", policy, [keys.latent], [keys.action], delayed)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        # Without this the weight would change, and nothing else.
+        if isinstance(value, (int, float)) and value > 0 and name in self.__dict__.get("_left_out", ()):
+            raise ConfigError(
+                f"expected {name} > 0 when {type(self).__name__} is made, if it is to be raised later, received 0 then and {value} now: its term is not "
+                f"computed. Make the loss with {name}={value} and set it to 0 until it is wanted"
+            )
+        super().__setattr__(name, value)
+
     @classmethod
     def options(cls) -> list[str]:
         """Names of all keyword options of the loss, those of its bases included."""
@@ -281,6 +297,8 @@ class LatentLoss(LossModule):
             self.register_coeff_buffer(name, float(value))
             if value > 0.0:
                 self._active.add(name)
+            elif any(name in base.__dict__.get("_optional", ()) for base in type(self).__mro__):
+                self.__dict__.setdefault("_left_out", set()).add(name)
 
     def _set_action_scale(self, action_scale: float | Sequence[float]) -> None:
         scale = torch.as_tensor(action_scale, dtype=torch.get_default_dtype())
@@ -293,6 +311,7 @@ class LatentLoss(LossModule):
         self, name: str, module: nn.Module, reads: list[NestedKey], writes: list[NestedKey], delayed: Iterable[str] = ()
     ) -> None:
         network = as_tensordict_module(module, reads, writes)
+        self._written[name] = written(network, writes[0])
         self.convert_to_functional(network, name, create_target_params=name in set(delayed))
         self._networks_used.append(name)
 
@@ -337,17 +356,25 @@ class LatentLoss(LossModule):
 
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
-        network = getattr(self, name)
+        value = self._value(name, inputs, params, method)
+        if name == "barrier" and method is None:
+            _check_barrier(value, inputs[0])
+        return value
+
+    def _value(self, name: str, inputs: tuple[Tensor, ...], params: str, method: str | None) -> Tensor:
+        network, key = getattr(self, name), self._written[name]
+        if name == "actor_network" and self.tensor_keys.action in network.out_keys:  # its name may have been changed since
+            key = self.tensor_keys.action
         if params != "target" and not is_compiling():
             leaves = _leaves(self, name, network)
             if all(_same(where.get(leaf), value) for where, leaf, value in leaves):  # nothing has to be put into it
                 if params == "online":
-                    return _called(network, inputs, method, self.tensor_keys.action)
+                    return _called(network, inputs, method, key)
                 learnt = [found for found in leaves if found[2].requires_grad]
                 try:
                     for where, leaf, value in learnt:
                         where[leaf] = value.data
-                    return _called(network, inputs, method, self.tensor_keys.action)
+                    return _called(network, inputs, method, key)
                 finally:
                     for where, leaf, value in learnt:
                         where[leaf] = value
@@ -358,13 +385,18 @@ class LatentLoss(LossModule):
         # body raised.
         swapped = values.to_module(network, preserve_module_state=False)
         try:
-            return _called(network, inputs, method, self.tensor_keys.action)
+            return _called(network, inputs, method, key)
         finally:
             swapped.to_module(network, preserve_module_state=False, return_swap=False)
 
     def _get(self, tensordict: TensorDictBase, key: NestedKey, field: str) -> Tensor:
         value = tensordict.get(key, None)
         if value is None:
+            if key == self.tensor_keys.observation and self.tensor_keys.frames in tensordict.keys(True, True):
+                raise ConfigError(
+                    f"expected the batch of {type(self).__name__} to hold {key!r}, received {self.tensor_keys.frames!r}, which only an encoder with a method "
+                    "sequence reads; TransitionStore(capacity, pixel_views=True) hands out both, or give your encoder that method"
+                )
             raise ConfigError(
                 f"expected the batch of {type(self).__name__} to hold {key!r}, received the entries "
                 f"{sorted(map(str, tensordict.keys(True, True)))}; collect it, or name yours with "

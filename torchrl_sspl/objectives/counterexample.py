@@ -11,7 +11,7 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.objectives.base import LatentLoss, trained_action
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, trained_action
 
 MODES = ("give_up", "least")
 
@@ -88,14 +88,16 @@ class CounterexampleLoss(LatentLoss):
         violation = (self._run("barrier", after, params="online" if least else "frozen") + self.dynamics_margin).clamp_min(0.0)
         short = (self.depth - self._run("barrier", batch.latent)).clamp_min(0.0)
         if least:
-            return self._terms(self._reduce(torch.minimum(violation, short), batch, worst=True), violation, short, tensordict)
+            return self._terms(self._reduce(torch.minimum(violation, short), batch, worst=True), violation, short, batch, tensordict)
         given_up = violation.detach().clamp_max(self.cap) / self.cap * short
         led_back = self.policy_coeff * violation * (short.detach() > 0.0)
-        return self._terms(self._reduce(given_up, batch, worst=True) + self._reduce(led_back, batch), violation, short, tensordict)
+        return self._terms(self._reduce(given_up, batch, worst=True) + self._reduce(led_back, batch), violation, short, batch, tensordict)
 
-    def _terms(self, loss: Tensor, violation: Tensor, short: Tensor, tensordict: TensorDictBase) -> TensorDict:
+    def _terms(self, loss: Tensor, violation: Tensor, short: Tensor, batch: LatentBatch, tensordict: TensorDictBase) -> TensorDict:
         found = violation.detach() * (short.detach() > 0.0)
-        counts = {"counterexample_max": found.max(), "counterexample_share": (found > 0.0).float().mean()}
+        counted = torch.ones_like(found, dtype=torch.bool) if batch.valid is None else batch.valid
+        found = torch.where(counted, found, 0.0)
+        counts = {"counterexample_max": found.max(), "counterexample_share": (found > 0.0).sum() / counted.sum().clamp_min(1)}
         return self._pack({"loss_counterexample": loss, **counts}, tensordict)
 
 

@@ -51,6 +51,8 @@ class PolicyDeviationLoss(LatentLoss):
             raise ConfigError(
                 f"expected user_policy to be None (zero action), 'data' or a module, received {user_policy!r}"
             )
+        if isinstance(detach, str) or not set(detach) <= {"encoder", "dynamics"}:  # SSPLLoss has both
+            raise ConfigError(f"expected detach to be () or ('encoder',), received {detach!r}")
         super().__init__(encoder=encoder, policy=policy, **shared)
         self.detach = tuple(detach)
         # Outside the module registry: it is not trained, and a target updater must not see it.
@@ -69,7 +71,8 @@ class PolicyDeviationLoss(LatentLoss):
         else:
             with torch.no_grad():
                 if isinstance(user, TensorDictModuleBase):
-                    action = user(tensordict.select(*user.in_keys)).get(keys.action)
+                    read = {key: self._get(tensordict, key, "observation") for key in user.in_keys}
+                    action = user(TensorDict(read, tensordict.batch_size)).get(keys.action)
                 else:
                     action = user(self._get(tensordict, self.in_keys[0], "observation"))
         batch.user_action = _clean(action.detach(), batch.valid)

@@ -76,7 +76,8 @@ class SaLaDLoss(LatentLoss):
     inverse_dynamics: TensorDictModuleBase
     inverse_dynamics_params: TensorDictParams
     target_inverse_dynamics_params: TensorDictParams
-    _schedulable_buffers = frozenset({"safe_coeff", "unsafe_coeff", "consistency_coeff", "inverse_dynamics_coeff"})
+    _optional = frozenset({"inverse_dynamics_coeff", "variance_coeff", "covariance_coeff", "saturation_coeff"})
+    _schedulable_buffers = frozenset({"safe_coeff", "unsafe_coeff", "consistency_coeff"}) | _optional
 
     def __init__(
         self,

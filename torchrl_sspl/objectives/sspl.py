@@ -63,6 +63,7 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
         >>> sum(value for key, value in loss(data).items() if key.startswith("loss_")).backward()
     """
 
+    _optional = frozenset({"policy_coeff"})
     _schedulable_buffers = frozenset({"synthesis_coeff", "salad_coeff", "policy_coeff"})
 
     def __init__(

@@ -74,6 +74,7 @@ class SynthesisLoss(LatentLoss):
         ['inside_share', 'loss_synthesis', 'violation_max', 'violation_share']
     """
 
+    _optional = frozenset({"growth_coeff", "off_manifold_coeff", "descent_coeff"})
     _schedulable_buffers = frozenset({"growth_coeff", "growth_depth", "off_manifold_coeff", "descent_coeff"})
 
     def __init__(

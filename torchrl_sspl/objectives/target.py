@@ -13,7 +13,7 @@ from torch import nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import safe_hinge, unsafe_hinge
-from torchrl_sspl.objectives.base import LatentLoss, trained_action
+from torchrl_sspl.objectives.base import LatentLoss, _batch_last, trained_action
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 
@@ -69,6 +69,8 @@ class TargetLoss(LatentLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+    _optional = frozenset({"safe_coeff", "unsafe_coeff"})
+    _schedulable_buffers = frozenset({"inside_coeff", "policy_coeff"}) | _optional
     _reads = ("barrier_target", "inside", "action_target", "action_weight")
 
     def __init__(
@@ -101,8 +103,8 @@ class TargetLoss(LatentLoss):
         """Terms of the loss on a batch of latents with their targets; the batch is not changed."""
         keys = self.tensor_keys
         batch = self._read(tensordict)
-        target = self._counted(tensordict, keys.barrier_target, "barrier_target", batch)
-        inside = self._get(tensordict, keys.inside, "inside")
+        target = _batch_last(self._counted(tensordict, keys.barrier_target, "barrier_target", batch), batch.shape)
+        inside = _batch_last(self._get(tensordict, keys.inside, "inside"), batch.shape)
         barrier = self._run("barrier", batch.latent)
         short = (target.clamp_max(self.outside_cap) - barrier).clamp_min(0.0)
         residual = (barrier - target).square() * self.inside_coeff
@@ -111,7 +113,7 @@ class TargetLoss(LatentLoss):
         action = trained_action(self, batch.latent)
         wanted = self._counted(tensordict, keys.action_target, "action_target", batch)
         gap = (action - wanted) / self.action_scale
-        weight = self._counted(tensordict, keys.action_weight, "action_weight", batch)
+        weight = _batch_last(self._counted(tensordict, keys.action_weight, "action_weight", batch), batch.shape)
         follow = weight * gap.square().mean(-1, keepdim=True)
         terms = {
             "loss_target": self._reduce(fit, batch, worst=True),

@@ -104,7 +104,7 @@ class MarginHook(_Hook):
         parts: list[tuple[Tensor, ...]] = []
         missing = self.samples
         while missing > 0:
-            batch = self.replay_buffer.sample().to(self.loss.safety_margin.device)
+            batch = self.replay_buffer.sample().to(next(self.loss.parameters()).device)
             action = batch.get(self.loss.tensor_keys.action)
             parts.append((*self.loss.latents(batch), action))
             missing -= len(action)

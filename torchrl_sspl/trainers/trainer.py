@@ -200,7 +200,7 @@ class SSPLTrainer(Trainer):
         self, replay_buffer: Any, margins: MarginHook | None, rollout_policy: TensorDictModuleBase | None, log: Path | None
     ) -> None:
         """The hooks of the joint training, in the order in which they act."""
-        loss, device = self.loss_module, self.loss_module.safety_margin.device
+        loss, device = self.loss_module, next(self.loss_module.parameters()).device
         replay = ReplayBufferTrainer(replay_buffer, flatten_tensordicts=True, device=None if device.type == "cpu" else device)
         self.register_op("batch_process", replay.extend)
         self.register_op("process_optim_batch", replay.sample)
