@@ -13,7 +13,7 @@ from tensordict.nn import dispatch
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, ShapeError
-from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, trained_action
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, set_action_scale, trained_action
 
 
 def interpolate(table: Tensor, action: Tensor, *, action_scale: float | Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class ActionValueLoss(LatentLoss):
             raise ConfigError(f"expected scale > 0, received {scale}")
         super().__init__(policy=policy, **shared)
         self.scale = float(scale)
-        self._set_action_scale(action_scale)
+        set_action_scale(self, action_scale)
         self.out_keys.append("loss_action_value")
 
     @dispatch

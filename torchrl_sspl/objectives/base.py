@@ -88,21 +88,18 @@ def _forget(loss: Any, *_: Any) -> None:
     loss._erase_cache()
 
 
-def _called(network: Any, inputs: tuple[Tensor, ...], method: str | None, key: NestedKey) -> Tensor:
-    """What a network gives, of several things the one with a key."""
+def _called(name: str, network: Any, inputs: tuple[Tensor, ...], method: str | None, key: NestedKey) -> Tensor:
+    """What a network gives, of several things the one with a key; a ShapeError if it is a barrier of another shape."""
     if method is not None:
         return getattr(network.module, method)(*inputs)
     output = network.module(*inputs) if type(network) is TensorDictModule else network(*inputs)
     if isinstance(output, tuple):
         output = output[network.out_keys.index(key)]
-    return output
-
-
-def _check_barrier(value: Tensor, latent: Tensor) -> None:
-    if value.shape != (*latent.shape[:-1], 1):
+    if name == "barrier" and output.shape != (expected := (*inputs[0].shape[:-1], 1)):
         raise ShapeError(
-            f"expected a barrier with one value for each latent, {(*latent.shape[:-1], 1)}, received {tuple(value.shape)}; let it keep its last dimension of size 1"
+            f"expected a barrier with one value for each latent, {expected}, received {tuple(output.shape)}; let it keep its last dimension of size 1"
         )
+    return output
 
 
 @lru_cache(maxsize=64)
@@ -135,6 +132,15 @@ def trained_action(loss: LatentLoss, latent: Tensor) -> Tensor:
             "discrete distribution); give it a deterministic or reparameterised one: actions pass through the dynamics"
         )
     return action
+
+
+def set_action_scale(loss: LatentLoss, action_scale: float | Sequence[float]) -> None:
+    """Gives a loss the buffer ``action_scale``; a ConfigError for what is none."""
+    scale = torch.as_tensor(action_scale, dtype=torch.get_default_dtype())
+    if scale.ndim > 1 or not bool(((scale > 0) & scale.isfinite()).all()):
+        raise ConfigError(f"expected action_scale > 0, a number or one per dimension, received {action_scale!r}")
+    # Not in the state: it belongs to the environment.
+    loss.register_buffer("action_scale", scale, persistent=False)
 
 
 class LatentLoss(LossModule):
@@ -300,13 +306,6 @@ class LatentLoss(LossModule):
             elif any(name in base.__dict__.get("_optional", ()) for base in type(self).__mro__):
                 self.__dict__.setdefault("_left_out", set()).add(name)
 
-    def _set_action_scale(self, action_scale: float | Sequence[float]) -> None:
-        scale = torch.as_tensor(action_scale, dtype=torch.get_default_dtype())
-        if scale.ndim > 1 or not bool(((scale > 0) & scale.isfinite()).all()):
-            raise ConfigError(f"expected action_scale > 0, a number or one per dimension, received {action_scale!r}")
-        # Not in the state: it belongs to the environment.
-        self.register_buffer("action_scale", scale, persistent=False)
-
     def _add(
         self, name: str, module: nn.Module, reads: list[NestedKey], writes: list[NestedKey], delayed: Iterable[str] = ()
     ) -> None:
@@ -356,12 +355,6 @@ class LatentLoss(LossModule):
 
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
-        value = self._value(name, inputs, params, method)
-        if name == "barrier" and method is None:
-            _check_barrier(value, inputs[0])
-        return value
-
-    def _value(self, name: str, inputs: tuple[Tensor, ...], params: str, method: str | None) -> Tensor:
         network, key = getattr(self, name), self._written[name]
         if name == "actor_network" and self.tensor_keys.action in network.out_keys:  # its name may have been changed since
             key = self.tensor_keys.action
@@ -369,12 +362,12 @@ class LatentLoss(LossModule):
             leaves = _leaves(self, name, network)
             if all(_same(where.get(leaf), value) for where, leaf, value in leaves):  # nothing has to be put into it
                 if params == "online":
-                    return _called(network, inputs, method, key)
+                    return _called(name, network, inputs, method, key)
                 learnt = [found for found in leaves if found[2].requires_grad]
                 try:
                     for where, leaf, value in learnt:
                         where[leaf] = value.data
-                    return _called(network, inputs, method, key)
+                    return _called(name, network, inputs, method, key)
                 finally:
                     for where, leaf, value in learnt:
                         where[leaf] = value
@@ -385,7 +378,7 @@ class LatentLoss(LossModule):
         # body raised.
         swapped = values.to_module(network, preserve_module_state=False)
         try:
-            return _called(network, inputs, method, key)
+            return _called(name, network, inputs, method, key)
         finally:
             swapped.to_module(network, preserve_module_state=False, return_swap=False)
 

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import policy_deviation
-from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, _clean, trained_action
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, _clean, set_action_scale, trained_action
 
 
 class PolicyDeviationLoss(LatentLoss):
@@ -117,7 +117,7 @@ class ActionChangeLoss(LatentLoss):
         self, dynamics: nn.Module, policy: nn.Module, *, action_scale: float | Sequence[float] = 1.0, **shared: Any
     ) -> None:
         super().__init__(dynamics=dynamics, policy=policy, **shared)
-        self._set_action_scale(action_scale)
+        set_action_scale(self, action_scale)
         self.out_keys.append("loss_action_change")
 
     @dispatch

@@ -13,7 +13,7 @@ from torch import nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import safe_hinge, unsafe_hinge
-from torchrl_sspl.objectives.base import LatentLoss, _batch_last, trained_action
+from torchrl_sspl.objectives.base import LatentLoss, _batch_last, set_action_scale, trained_action
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 
@@ -94,7 +94,7 @@ class TargetLoss(LatentLoss):
             inside_coeff=inside_coeff, policy_coeff=policy_coeff, safe_coeff=safe_coeff, unsafe_coeff=unsafe_coeff
         )
         self.outside_cap, self.scale = float(outside_cap), float(scale)
-        self._set_action_scale(action_scale)
+        set_action_scale(self, action_scale)
         self._needs.add("region")
         self.out_keys += ["loss_target", "loss_policy_target", "loss_safe", "loss_unsafe"]
 
