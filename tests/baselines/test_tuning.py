@@ -127,6 +127,13 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
     path.write_text(json.dumps(told))  # trials of something else
     monkeypatch.setattr("torchrl_sspl.baselines.tuning.search", lambda *of: (("beta=3.0",), []))
     assert run_cell(Cell.of("nerf_cbf", ["seed=2", *words]))["tuning"]["chosen"] == ["beta=3.0"]
+    monkeypatch.undo()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(kind_of("nerf_cbf"), "space", {"beta": (7.0, 8.0), "steps": (900,)})
+    told["of"]["horizon"] = 4
+    path.write_text(json.dumps(told))  # of another space: the defaults alone are the same
+    trials = run_cell(Cell.of("nerf_cbf", ["seed=4", *words]))["tuning"]["trials"]
+    assert sorted(t["options"] for t in trials) == [[], ["beta=7.0"], ["beta=8.0"]]
     path.write_text("{")
     with pytest.raises(OutputError, match=r"trials in '.*', received what cannot be read"):
         run_cell(Cell.of("nerf_cbf", ["seed=3", *words]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import io
+import itertools
 import json
 import tempfile
 import time
@@ -206,18 +207,19 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(path.with_name(f".{TRIALS_FILE}.lock")):  # another seed waits for them
-        return tuning.search(trial, options, _told(path, asked), lambda so_far: write(path, json.dumps({"of": asked, "trials": so_far}, indent=1) + "\n"))
+        return tuning.search(trial, options, _told(path, asked, options), lambda so_far: write(path, json.dumps({"of": asked, "trials": so_far}, indent=1) + "\n"))
 
 
-def _told(path: Path, asked: dict[str, Any]) -> list[dict[str, Any]]:
-    """The trials that an earlier call has made."""
+def _told(path: Path, asked: dict[str, Any], options: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
+    """The trials that an earlier call has made, as far as they are those of these options: a space may have changed since."""
     if not path.is_file():
         return []
     try:
         found = json.loads(path.read_text())
     except ValueError as error:
         raise OutputError(f"expected trials in '{path}', received what cannot be read: {error}; remove it") from error
-    return found["trials"] if found.get("of") == asked else []
+    pairs = zip(found["trials"], options, strict=False) if found.get("of") == asked else ()
+    return [trial for trial, _ in itertools.takewhile(lambda pair: pair[0]["options"] == list(pair[1]), pairs)]
 
 
 def run_cell(cell: Cell) -> dict[str, Any]:

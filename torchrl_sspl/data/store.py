@@ -403,7 +403,8 @@ def _wrong(meta: Any, columns: dict[str, Any]) -> str:
     kinds = {"len": int, "cursor": int, "keep_state": bool}
     if not isinstance(meta, dict) or any(type(meta.get(k)) is not kind for k, kind in kinds.items()):
         return f"'_meta' {meta!r:.60}"
-    n, counts = meta["len"], [meta.get("recorded", 0), *meta.get("given", (0, 0))]
+    n, given = meta["len"], meta.get("given", [0, 0])
+    counts = [meta.get("recorded", 0), *(given if isinstance(given, list) else ())]
     if len(counts) != 3 or any(type(count) is not int or count < 0 for count in counts):
         return f"counts {counts!r:.60} of transitions and labels"
     if n < 0 or meta["cursor"] < 0:
