@@ -119,6 +119,10 @@ def test_a_store_holds_no_more_labels_than_it_may():
         again.extend(rows(codes(1, 1, 1, 1, 1)))  # in the place of the two labels of S that came first: no other one is given
         assert (again.region == SAFE).sum() == 1
         assert (again.given, again.recorded) == ({SAFE: 3, UNSAFE: 2}, 25)
+    last = TransitionStore(20, labels=Labels(safe=3, unsafe=2))
+    last.load_state_dict(store.state_dict())  # of which two labels of S were overwritten
+    last.extend(rows(codes(1, 1, 1, 1, 1)))
+    assert last.given == {SAFE: 3, UNSAFE: 2}
     plain = TransitionStore(20)
     plain.extend(rows(codes(1, 2, 0)))
     assert plain.get(slice(None))["next", "region"].flatten().tolist() == [1, 2, 0]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 BASE, SALAD, STORE = "torchrl_sspl/objectives/base.py", "torchrl_sspl/modules/salad.py", "torchrl_sspl/data/store.py"
-LOSSES, STORED = "tests/objectives/test_losses.py", "tests/data/test_store.py"
+LOSSES, STORED = "tests/objectives/test_what_is_given.py", "tests/data/test_store.py"
 
 MUTANTS = [
     (BASE, "output[network.out_keys.index(key)]", "output[0]", LOSSES),

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule, TensorDictSequential
+from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError, DTypeError, NotPositiveDefiniteError, ShapeError
@@ -18,13 +18,11 @@ from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, SaLaD
 from torchrl_sspl.objectives import (
     PRESETS,
     ActionChangeLoss,
-    CounterexampleLoss,
     LipschitzLoss,
     PolicyDeviationLoss,
     SaLaDLoss,
     SSPLLoss,
     SynthesisLoss,
-    TargetLoss,
 )
 
 
@@ -515,114 +513,3 @@ def test_region_codes_outside_the_table_are_named() -> None:
     after = TensorDict(latent=torch.rand(4, 2), batch_size=4)
     with pytest.raises(ConfigError, match=r"received \[7\]"):
         loss(small_batch(region=codes).set("next", after))
-
-
-def three() -> TensorDict:
-    return batch(latents(-0.3, 0.1, 0.7), latents(-0.2, 0.1, 0.7), torch.zeros(3, 1), [1, 0, 2])
-
-
-def test_of_several_entries_the_one_that_is_meant_is_trained() -> None:
-    torch.manual_seed(0)
-    body, head = nn.Linear(2, 3), nn.Linear(3, 1)
-    deep = TensorDictSequential(TensorDictModule(body, ["latent"], ["hidden"]), TensorDictModule(head, ["hidden"], ["barrier"]))
-    plain = nn.Sequential(body, head)
-    found, wanted = (SaLaDLoss(None, Adds(), net, consistency="online")(three()) for net in (deep, plain))
-    for key in sorted(wanted.keys()):
-        torch.testing.assert_close(found[key], wanted[key])
-    found["loss_safe"].backward()
-    assert head.weight.grad is not None
-    other = TensorDictSequential(TensorDictModule(body, ["latent"], ["hidden"]), TensorDictModule(head, ["hidden"], ["height"]))
-    with pytest.raises(ConfigError, match=r"a module that writes 'barrier', or one entry alone, received one that writes \['hidden', 'height'\]"):
-        SaLaDLoss(None, Adds(), other, consistency="online")
-
-
-def test_networks_that_read_in_another_order_are_refused() -> None:
-    turned = TensorDictModule(Adds(), in_keys=["action", "latent"], out_keys=[("next", "latent")])
-    with pytest.raises(ConfigError, match="in this order, received"):
-        SaLaDLoss(None, turned, Reads(), consistency="online")
-
-
-class Flat(Reads):
-    def forward(self, latent: Tensor) -> Tensor:
-        return super().forward(latent)[..., 0]
-
-
-@pytest.mark.parametrize("make", [
-    lambda: SaLaDLoss(None, Adds(), Flat(), consistency="online"),
-    lambda: SynthesisLoss(None, Adds(), Flat(), Reads()),
-])  # fmt: skip
-def test_a_barrier_without_its_last_dimension_is_refused(make) -> None:
-    with pytest.raises(ShapeError, match=r"one value for each latent, \(.*, 1\), received \(.*3,?\); let it keep its last dimension"):
-        make()(three())
-
-
-def test_targets_may_lack_their_last_dimension() -> None:
-    row = {"latent": latents(-0.3, 0.1), "region": torch.zeros(2, 1, dtype=torch.int64), "action_target": torch.ones(2, 1)}
-    flat = {"barrier_target": torch.tensor([-0.1, 0.2]), "inside": torch.tensor([True, False]), "action_weight": torch.tensor([1.0, 0.5])}
-    deep = {key: value[:, None] for key, value in flat.items()}
-    loss = TargetLoss(Reads(), Reads())
-    found, wanted = (loss(TensorDict(row | part, [2])) for part in (flat, deep))
-    for key in sorted(wanted.keys()):
-        torch.testing.assert_close(found[key], wanted[key])
-
-
-@pytest.mark.parametrize(("make", "name"), [
-    (lambda **weight: SSPLLoss(*_nets(), **weight), "policy_coeff"),
-    (lambda **weight: SSPLLoss(*_nets(), **weight), "growth_coeff"),
-    (lambda **weight: SaLaDLoss(None, Adds(), Reads(), consistency="online", **weight), "variance_coeff"),
-    (lambda **weight: TargetLoss(Reads(), Reads(), **weight), "unsafe_coeff"),
-])  # fmt: skip
-def test_a_term_that_was_left_out_cannot_be_weighted_later(make, name: str) -> None:
-    loss = make(**{name: 0.0})
-    with pytest.raises(ConfigError, match=f"expected {name} > 0 when .* is made"):
-        setattr(loss, name, 0.5)
-    setattr(loss, name, 0.0)
-    loss = make(**{name: 0.5})
-    setattr(loss, name, 0.0)
-    setattr(loss, name, 0.25)
-    assert float(getattr(loss, name)) == 0.25
-
-
-def test_an_encoder_without_sequence_is_told_how_to_get_observations() -> None:
-    class Mean(nn.Module):
-        def forward(self, pixels: Tensor) -> Tensor:
-            return pixels.float().mean((-1, -2))[..., :2]
-
-    data = three().set("frames", torch.zeros(3, 3, 3, 4, 4, dtype=torch.uint8))
-    with pytest.raises(ConfigError, match=r"received 'frames', which only an encoder with a method sequence reads; TransitionStore\(capacity, pixel_views=True\)"):
-        SaLaDLoss(Mean(), Adds(), Reads(), consistency="online")(data)
-
-
-@pytest.mark.parametrize("detach", ["encoder", ("encode",)])
-def test_networks_to_detach_are_named_in_a_tuple(detach) -> None:
-    with pytest.raises(ConfigError, match="expected detach to be"):
-        PolicyDeviationLoss(None, Policy(2, 1), detach=detach)
-
-
-def test_a_users_policy_that_reads_what_is_not_there_is_told_so() -> None:
-    user = TensorDictModule(nn.Identity(), ["elsewhere"], ["action"])
-    with pytest.raises(ConfigError, match="to hold 'elsewhere'"):
-        PolicyDeviationLoss(None, Policy(2, 1), user_policy=user)(three())
-
-
-def test_rows_that_do_not_count_are_no_counterexamples() -> None:
-    data = TensorDict(latent=latents(-0.5, -0.5), batch_size=[2])
-    loss = CounterexampleLoss(Adds(), Reads(), Shift())
-    assert loss(data)["counterexample_share"] == 1.0
-    data["collector", "mask"] = torch.tensor([True, False])
-    data["latent"][1] = 0.5
-    found = loss(data)
-    assert found["counterexample_share"] == 1.0
-    data["collector", "mask"] = torch.tensor([False, True])
-    assert loss(data)["counterexample_max"] == 0.0
-
-
-class Shift(nn.Module):
-    """A policy that moves every latent by one."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.by = nn.Parameter(torch.ones(1))
-
-    def forward(self, latent: Tensor) -> Tensor:
-        return self.by.expand(*latent.shape[:-1], 1)
