@@ -74,6 +74,7 @@ def test_every_extension_is_one_file():
         assert f"| {name} | 1 |" in page
 
 
+@pytest.mark.slow
 def test_an_encoder_is_trained_and_measured_by_two_commands(use, tmp_path, capsys):
     assert nn.Module in use("my_encoder.py")["Small"].__mro__
     commands = [line.split() for line in sections()["Your own encoder"].split("```sh\n")[1].split("```")[0].splitlines()]

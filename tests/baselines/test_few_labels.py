@@ -87,6 +87,7 @@ def test_a_figure_of_nothing_is_refused(tmp_path):
         runpy.run_path(str(BENCHMARK))["figure"](tmp_path)
 
 
+@pytest.mark.slow
 def test_without_unlabelled_pictures_every_one_has_a_label(tmp_path, monkeypatch, capsys):
     words = ["labels=all", "transitions=640", "seed=0", "starts=[0,0.5,0.5]", "collector.max_frames_per_traj=1", f"out={tmp_path}", *SIZES, *SHORT]
     start(monkeypatch, *words)

@@ -66,6 +66,7 @@ def test_started_again_it_is_not_trained_again(program, trained, tmp_path, capsy
     assert "missed" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_shipped_agent_is_evaluated_and_none_is_trained(program, tmp_path):
     words = ["preset=smoke", "agent=pendulum", "trainer.progress=false", "evaluation.kernel_grid=61", f"out_dir={tmp_path}"]
     assert program(EXAMPLE, *words) == 0

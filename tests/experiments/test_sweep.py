@@ -176,7 +176,7 @@ def test_every_run_has_one_thread(command):
 
 @pytest.mark.parametrize(
     ("number", "launcher"),
-    [(signal.SIGINT, "local"), (signal.SIGTERM, "local"), pytest.param(signal.SIGINT, "ray", marks=pytest.mark.ray)],
+    [pytest.param(signal.SIGINT, "local", marks=pytest.mark.slow), (signal.SIGTERM, "local"), pytest.param(signal.SIGINT, "ray", marks=pytest.mark.ray)],
 )
 def test_a_signal_stops_the_runs_and_the_same_command_goes_on(command, number, launcher):
     if launcher == "ray":

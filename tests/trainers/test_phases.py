@@ -306,7 +306,7 @@ def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p
     assert_same(resumed(tmp_path / "killed", *car).train(), expected)
 
 
-@pytest.mark.parametrize("encoder", ["BearingEncoder", "ShapeBearingEncoder"])
+@pytest.mark.parametrize("encoder", ["BearingEncoder", pytest.param("ShapeBearingEncoder", marks=pytest.mark.slow)])
 def test_a_grid_of_latents_that_a_picture_shows_whole_trains(tmp_path, encoder):
     car = ("env=cmu", "env.image_size=32", f"network.encoder={encoder}", "network.latent_dim=2", "network.remember_action=false",
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value")  # fmt: skip
