@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -140,7 +141,7 @@ def test_a_signal_ends_the_processes_too(tmp_path):
     words = ["table", "methods=" + ",".join(f"lqr:alpha=0.{k}" for k in range(1, 10)), "env=pendulum", "jobs=2"]
     path = os.pathsep.join([str(Path(torchrl_sspl.__file__).parents[1]), os.environ.get("PYTHONPATH", "")])
     run = subprocess.Popen([sys.executable, "-c", code, *words, *SMALL[1:], "score.episodes=3000000"], cwd=tmp_path, env=os.environ | {"PYTHONPATH": path},
-                           stderr=subprocess.PIPE, text=True)  # fmt: skip
+                           stderr=subprocess.PIPE, text=True, start_new_session=True)  # fmt: skip
     try:
         begun = time.monotonic()
         while not list(tmp_path.rglob(".owner.json")):
@@ -149,7 +150,8 @@ def test_a_signal_ends_the_processes_too(tmp_path):
         run.send_signal(signal.SIGTERM)
         _, told = run.communicate(timeout=60)
     finally:
-        run.kill()
+        with suppress(ProcessLookupError):  # what goes on where it should not
+            os.killpg(run.pid, signal.SIGKILL)
     assert run.returncode == 143
     assert "rows and trials that are done stay" in told
     assert not list(tmp_path.rglob(".owner.json"))  # none of them goes on
