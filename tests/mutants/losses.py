@@ -16,5 +16,5 @@ MUTANTS = [
     (STORE, "            sampler.mark_update(index)", "            pass", STORED),
     (STORE, "v.roll(-meta[\"cursor\"], 0)", "v", STORED),
     (STORE, "            self._cursor = self._len\n", "", STORED),
-    (STORE, "if mask is None else data[mask.reshape(data.batch_size)]", "if mask is None else data.reshape(-1)", STORED),
+    (STORE, "return data if mask is None else data[mask.reshape(data.batch_size)]", "return data", STORED),
 ]

@@ -16,16 +16,13 @@ from typing import Any
 
 import numpy as np
 import torch
-import yaml
 from filelock import FileLock
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_sspl.baselines import tuning
 from torchrl_sspl.baselines.base import BUDGETS, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, record
 from torchrl_sspl.baselines.pictures import Album
-from torchrl_sspl.baselines.registry import kind_of, make
+from torchrl_sspl.baselines.registry import changed, kind_of, make
 from torchrl_sspl.baselines.scoring import ScoreConfig, score, sizes_of
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.envs.base import SafetyEnv
@@ -91,11 +88,7 @@ class Cell:
                 raise ConfigError(f"expected {number} to be an integer >= 0, received '{own[number]}'")
         if int(own.get("trials", 0)) and int(own.get("seed", 0)) == tuning.SEED:
             raise ConfigError(f"expected another seed than {tuning.SEED} with trials, which are made with that one, received it")
-        try:
-            sizes: Any = OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(ScoreConfig), OmegaConf.from_dotlist(scores)))
-        except (OmegaConfBaseException, yaml.YAMLError) as error:
-            valid = ", ".join(OmegaConf.structured(ScoreConfig))
-            raise ConfigError(f"expected score.* among {valid}, received {scores} ({' '.join(str(error).split())})") from error
+        sizes: Any = changed(ScoreConfig, scores, "expected score.*")
         sizes.check()
         budget = own.get("budget", "small") if kind.learns else "none"
         trials = int(own.get("trials", 0)) if kind.learns and not trained_before(options) else 0
@@ -148,16 +141,20 @@ def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
     path = cell.directory / ROW_FILE
     if not path.is_file():
         return None
-    try:
-        row = json.loads(path.read_text())
-    except ValueError as error:
-        raise OutputError(f"expected a row in '{path}', received what cannot be read: {error}; remove it") from error
+    row = _read(path, "a row")
     found = row.get("cell") or {}
     if found.get("weights") != cell.describe().get("weights"):
         return None
     if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
         raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; remove it, or choose another out_dir for one row")
     return row
+
+
+def _read(path: Path, what: str) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text())
+    except ValueError as error:
+        raise OutputError(f"expected {what} in '{path}', received what cannot be read: {error}; remove it") from error
 
 
 @functools.lru_cache(maxsize=1)
@@ -214,10 +211,7 @@ def _told(path: Path, asked: dict[str, Any], options: Sequence[Sequence[str]]) -
     """The trials that an earlier call has made, as far as they are those of these options: a space may have changed since."""
     if not path.is_file():
         return []
-    try:
-        found = json.loads(path.read_text())
-    except ValueError as error:
-        raise OutputError(f"expected trials in '{path}', received what cannot be read: {error}; remove it") from error
+    found = _read(path, "trials")
     pairs = zip(found["trials"], options, strict=False) if found.get("of") == asked else ()
     return [trial for trial, _ in itertools.takewhile(lambda pair: pair[0]["options"] == list(pair[1]), pairs)]
 

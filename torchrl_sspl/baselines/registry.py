@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import yaml
 from omegaconf import OmegaConf
@@ -59,16 +60,27 @@ def make(name: str, options: Sequence[str] = ()) -> SafetyMethod:
         if options:
             raise ConfigError(f"{name}: expected no options, received {list(options)}")
         return kind()
-    try:
-        merged = OmegaConf.merge(OmegaConf.structured(kind.Config), OmegaConf.from_dotlist(list(options)))
-    except (OmegaConfBaseException, yaml.YAMLError) as error:
-        valid = ", ".join(OmegaConf.structured(kind.Config))
-        raise ConfigError(f"{name}: expected options among {valid}, received {list(options)} ({' '.join(str(error).split())})") from error
+    config = changed(kind.Config, options, f"{name}: expected options")
     for key, usual in vars(kind.Config()).items():
-        value, least = merged[key], min(1, usual) if type(usual) is int else -math.inf
+        value, least = getattr(config, key), min(1, usual) if type(usual) is int else -math.inf
         if isinstance(value, (int, float)) and not least <= value < math.inf:
             raise ConfigError(f"{name}: expected {key} {f'>= {least}' if type(usual) is int else 'to be finite'}, received {value}")
-    return kind(OmegaConf.to_object(merged))
+    return kind(config)
+
+
+def changed(config: type, words: Sequence[str], expected: str) -> Any:
+    """A dataclass of options with ``key=value`` changes; a ConfigError that begins with what was ``expected`` if one is not valid. Source: none.
+
+    Example:
+        >>> from torchrl_sspl.baselines import ScoreConfig
+        >>> changed(ScoreConfig, ["episodes=10"], "expected score.*").episodes
+        10
+    """
+    usual = OmegaConf.structured(config)
+    try:
+        return OmegaConf.to_object(OmegaConf.merge(usual, OmegaConf.from_dotlist(list(words))))
+    except (OmegaConfBaseException, yaml.YAMLError) as error:
+        raise ConfigError(f"{expected} among {', '.join(usual)}, received {list(words)} ({' '.join(str(error).split())})") from error
 
 
 __all__ = ["METHODS", "kind_of", "make"]

@@ -296,14 +296,10 @@ def _loops(it: _Score, name: str, keep, index: int) -> list[tuple[Tensor, Tensor
 def _calibrated(it: _Score, sets: tuple[Tensor, Tensor, Tensor], found: list[tuple[Tensor, Tensor]]) -> None:
     """The same sets and episodes at a level that other episodes have placed."""
     names = [f"calibrated_{n}_enter" for n in NOMINALS]
-    if len(found) < 2:  # nothing is claimed: a set of size zero, which counts in a mean over seeds
+    check = it.starts(it.inside, 2, it.config.check_episodes) if len(found) == 2 else torch.zeros(0)
+    if not len(check):  # a set of size zero, which counts in a mean over seeds; of a handful of states starts may be found once and not again
         _count_sets(it.out, "calibrated_", torch.zeros_like(sets[1]), *sets[1:])
-        it.out.missing(*names, note="nothing is claimed")
-        return
-    check = it.starts(it.inside, 2, it.config.check_episodes)
-    if not len(check):  # starts were found, and now there are none: a handful of states
-        _count_sets(it.out, "calibrated_", torch.zeros_like(sets[1]), *sets[1:])
-        it.out.missing(*names, note="so little is claimed that no episode was found to place a level by")
+        it.out.missing(*names, note="so little is claimed that no episode was found to place a level by" if found else "nothing is claimed")
         return
     half = check[: len(check) // 2], check[len(check) // 2 :]
     both = [(x, it.episodes(x, make(it.env))[1]) for x, make in zip(half, (harmless, adversarial), strict=True) if len(x)]

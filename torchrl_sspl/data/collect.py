@@ -23,7 +23,7 @@ from torch import Tensor, nn
 from torchrl.collectors import BaseCollector, Collector
 from torchrl.envs import EnvBase
 
-from torchrl_sspl.data.store import TransitionStore
+from torchrl_sspl.data.store import TransitionStore, without_padding
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.sets import Region
 
@@ -208,9 +208,7 @@ def collect_rollouts(
                 source.set_seed(seed)
             missing = n
             for data in source:
-                mask = data.get(("collector", "mask"), None)
-                if mask is not None:  # split_trajs: what trajectories are filled up with does not count
-                    data = data[mask.reshape(data.batch_size)]
+                data = without_padding(data)
                 # Environments last, so that a last batch that is larger than needed is cut in time.
                 rows = data[..., : -(-missing * data.shape[-1] // data.numel())].reshape(-1)[:missing]
                 store.extend(rows)

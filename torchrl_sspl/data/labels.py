@@ -100,7 +100,7 @@ class Labels:
     @property
     def tells(self) -> bool:
         """Whether labels say something of pictures that have none."""
-        return bool(self.choose) or self.infers
+        return bool(self.kept)
 
     def answers(self, region: Tensor, position: int = 0) -> Tensor:
         """What is said of every picture ``(n, 1)`` that is asked for, some of it wrong; a ShapeError for another shape."""

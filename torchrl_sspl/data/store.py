@@ -130,9 +130,7 @@ class TransitionStore(Storage):
 
     def extend(self, data: TensorDictBase) -> Tensor:
         """Add transitions ``(*batch,)``, time last; the oldest make room. Returns positions."""
-        mask = data.get(("collector", "mask"), None)
-        # What TorchRL fills trajectories of unequal length up with are no transitions.
-        data = data.reshape(-1) if mask is None else data[mask.reshape(data.batch_size)]
+        data = without_padding(data).reshape(-1)
         index = (self._cursor + torch.arange(data.shape[0])) % self.max_size
         self.set(index, data)
         for sampler in self._attached_entities:
@@ -345,6 +343,12 @@ class TransitionStore(Storage):
         return (index >= 0) & (index < self._len)
 
 
+def without_padding(data: TensorDictBase) -> TensorDictBase:
+    """Without what TorchRL fills trajectories of unequal length up with (``split_trajs``), which are no transitions. Source: none."""
+    mask = data.get(("collector", "mask"), None)
+    return data if mask is None else data[mask.reshape(data.batch_size)]
+
+
 def continues(store: TransitionStore, index: Tensor) -> Tensor:
     """Whether transitions at positions ``(k,)`` go on where the one before them in the store ends, ``(k,)`` bool.
 
@@ -498,4 +502,4 @@ class RegionSampler(Sampler):
         """Nothing to forget."""
 
 
-__all__ = ["RegionSampler", "TransitionStore", "continues"]
+__all__ = ["RegionSampler", "TransitionStore", "continues", "without_padding"]

@@ -201,10 +201,11 @@ class Predict(TensorDictModuleBase):
         super().__init__()
         self.dynamics = as_tensordict_module(dynamics, ["latent", "action"], [("next", "latent")])
         self.in_keys, self.out_keys = list(self.dynamics.in_keys), [("next", "prior")]
+        self._after = written(self.dynamics, ("next", "latent"))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``("next", "prior")`` ``(*batch, p)``."""
-        after = self.dynamics(tensordict.select(*self.in_keys))[written(self.dynamics, ("next", "latent"))]
+        after = self.dynamics(tensordict.select(*self.in_keys))[self._after]
         return tensordict.set(("next", "prior"), after)
 
 
