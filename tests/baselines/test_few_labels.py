@@ -27,7 +27,7 @@ def start(monkeypatch, *words: str) -> None:
 
 
 def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, monkeypatch, capsys):
-    words = ["labels=20,all", "transitions=1280", "wrong=0.05", "seed=0", f"out={tmp_path}", *SIZES, *SHORT]
+    words = ["labels=20", "transitions=1280", "wrong=0.05", "seed=0", f"out={tmp_path}", *SIZES, *SHORT]
 
     def run(*more: str) -> str:
         start(monkeypatch, *words, *more)
@@ -39,8 +39,7 @@ def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, 
     check = json.loads((tmp_path / "points.json").read_text())[0]["checks"][0]
     assert f"| 0.05 | 0 | {check['reason'] or check['level']} |" in printed
     found = json.loads((tmp_path / "points.json").read_text())
-    assert [row["labels"] for row in found] == ["20", "all"]
-    assert found[1]["needs"]["safe_labels"] > 100
+    assert [row["labels"] for row in found] == ["20"]
     before = [path.stat().st_mtime_ns for path in sorted(tmp_path.rglob("point.json"))]
     assert run() == printed
     assert run("run=false") == printed

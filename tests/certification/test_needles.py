@@ -326,9 +326,9 @@ def false_and_missed(seed: int) -> tuple[int, int, int]:
 
 
 def test_random_closed_loops_are_never_proved_to_do_what_a_grid_shows_they_do_not():
-    found = [false_and_missed(seed) for seed in range(10)]
+    found = [false_and_missed(seed) for seed in range(6)]
     assert sum(false for false, _, _ in found) == 0
-    assert sum(missed for _, missed, _ in found) <= 2  # true claims are proved: the bounds do say something
+    assert sum(missed for _, missed, _ in found) <= 1  # true claims are proved: the bounds do say something
 
 
 @pytest.mark.slow

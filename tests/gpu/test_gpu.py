@@ -204,7 +204,7 @@ AS_PRINTED = ["loss.preset=paper", "loss.reduction=mean", "network.barrier=lmi",
 @pytest.mark.parametrize(
     ("words", "phases"),
     [
-        ([], 2 * ROUND),
+        pytest.param([], 2 * ROUND, marks=pytest.mark.slow),  # the next has the same phases, and one more
         (["synthesis.teacher=value", "synthesis.rounds=1"], [*ROUND[:2], "teach", *ROUND[2:]]),
         (AS_PRINTED, []),
     ],
@@ -228,6 +228,7 @@ def test_all_phases_learn_from_pixels_on_the_gpu(words, phases, tmp_path):
     assert experiment.phases.finished
 
 
+@pytest.mark.slow
 def test_interrupted_phases_go_on_as_if_nothing_had_happened_on_the_gpu(deterministic, tmp_path):
     words = [*SINGLE, SAVED, "device=cuda"]
     whole = Experiment(compose([*SINGLE, "device=cuda", f"out_dir={tmp_path / 'whole'}"])).train()

@@ -70,6 +70,7 @@ def test_it_refuses_what_a_gpu_refuses(environment):
     assert all(part in said[code] for code, part in REFUSED.items()), said
 
 
+@pytest.mark.slow
 def test_a_run_that_began_on_a_gpu_goes_on_without_one(environment, tmp_path):
     code = "import simulated_cuda, test_gpu; from pathlib import Path; "
     code += f"test_gpu.interrupt(test_gpu.saving_experiment(Path({str(tmp_path)!r}), 'cuda'))"

@@ -30,7 +30,7 @@ def example():
 
 def test_a_loop_of_ones_own_separates_safe_from_unsafe(example) -> None:
     # Two sets are told apart by their pictures; no episode has to be watched for long.
-    result = example.main(*SMALL, "evaluation.episodes=10", "evaluation.horizon=2", batches=6, updates=50, loop=True, phases=False)
+    result = example.main(*SMALL, "evaluation.episodes=10", "evaluation.horizon=2", "evaluation.grid=15", "evaluation.kernel_grid=31", batches=6, updates=50, loop=True, phases=False)
     assert result["safe_called_unsafe"] <= 0.05
     assert result["unsafe_called_safe"] <= 0.05
     assert set(result) == set(example.SHOWN)

@@ -144,7 +144,7 @@ def test_collector_processes_and_temporary_files_are_gone_with_the_run(tmp_path,
 def test_a_run_that_waits_for_nothing_is_told_from_a_slow_one(does, ended):
     run = subprocess.Popen([sys.executable, "-c", f"import time; {does}"])
     try:
-        assert ends(lambda: [] if run.poll() is not None else [run.pid], patience=10.0, least=0.02) == ended
+        assert ends(lambda: [] if run.poll() is not None else [run.pid], patience=10.0 if ended else 3.0, least=0.02) == ended
     finally:
         run.kill()
         run.wait()
