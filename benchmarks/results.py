@@ -1,7 +1,8 @@
-"""The tables of docs/results.md, from the metrics.json of runs with several seeds.
+"""The tables of docs/results.md, from the metrics.json of runs with several seeds, or what lies beside an agent.
 
 Run: python benchmarks/results.py runs/pendulum runs/pendulum-1 runs/pendulum-2
-Prints a table in Markdown: requirements first, then what else is worth a look; each column is one run.
+     python benchmarks/results.py torchrl_sspl/agents/pendulum
+Prints a table in Markdown: requirements first, then what else is worth a look; each column is one run or agent.
 """
 
 from __future__ import annotations
@@ -52,9 +53,14 @@ def value(m: dict[str, Any] | None) -> str:
     return f"{m['value']:.3g}"
 
 
+def read(*places: Path) -> dict[str, Any]:
+    """The first of these files that is there: a run's, or an agent's."""
+    return json.loads(next((place for place in places if place.is_file()), places[0]).read_text())
+
+
 def certificate(run: Path) -> dict[str, str]:
     """What the certificate beside the agent says: its level, what is proved, and the risk of an episode."""
-    body = json.loads((run / "agent" / "certificate.json").read_text())
+    body = read(run / "agent" / "certificate.json", run / "certificate.json")
     rows = {"level s of the set {B <= s} that it is about": f"{body['level']:g}"}
     said = {s["name"]: s for layer in body["layers"].values() for s in layer["statements"]}
     for name, label in CERTIFIED.items():
@@ -74,7 +80,7 @@ def certificate(run: Path) -> dict[str, str]:
 
 def main(runs: list[str]) -> None:
     """Print the table."""
-    bodies = [json.loads((Path(run) / "metrics.json").read_text()) for run in runs]
+    bodies = [read(Path(run) / "metrics.json", Path(run) / "evaluation.json") for run in runs]
     rows: dict[str, list[str]] = {}
     asked = {r["name"]: r for r in bodies[0]["requirements"]}
     for frames in sorted(bodies[0]["measurements"], key=lambda name: name != "own"):
