@@ -26,8 +26,9 @@ def start(monkeypatch, *words: str) -> None:
     runpy.run_path(str(BENCHMARK), run_name="__main__")
 
 
-def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, monkeypatch, capsys):
-    words = ["labels=20", "transitions=1280", "wrong=0.05", "seed=0", f"out={tmp_path}", *SIZES, *SHORT]
+@pytest.mark.parametrize("labels", [["20"], pytest.param(["20", "all"], marks=pytest.mark.slow)], ids=",".join)
+def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, monkeypatch, capsys, labels):
+    words = [f"labels={','.join(labels)}", "transitions=1280", "wrong=0.05", "seed=0", f"out={tmp_path}", *SIZES, *SHORT]
 
     def run(*more: str) -> str:
         start(monkeypatch, *words, *more)
@@ -39,7 +40,8 @@ def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, 
     check = json.loads((tmp_path / "points.json").read_text())[0]["checks"][0]
     assert f"| 0.05 | 0 | {check['reason'] or check['level']} |" in printed
     found = json.loads((tmp_path / "points.json").read_text())
-    assert [row["labels"] for row in found] == ["20"]
+    assert [row["labels"] for row in found] == labels
+    assert "all" not in labels or found[1]["needs"]["safe_labels"] > 100
     before = [path.stat().st_mtime_ns for path in sorted(tmp_path.rglob("point.json"))]
     assert run() == printed
     assert run("run=false") == printed

@@ -204,7 +204,7 @@ AS_PRINTED = ["loss.preset=paper", "loss.reduction=mean", "network.barrier=lmi",
 @pytest.mark.parametrize(
     ("words", "phases"),
     [
-        pytest.param([], 2 * ROUND, marks=pytest.mark.slow),  # the next has the same phases, and one more
+        pytest.param([], 2 * ROUND, marks=pytest.mark.slow),  # the next has all phases of one round
         (["synthesis.teacher=value", "synthesis.rounds=1"], [*ROUND[:2], "teach", *ROUND[2:]]),
         (AS_PRINTED, []),
     ],

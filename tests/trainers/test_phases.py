@@ -297,8 +297,7 @@ def test_targets_on_a_grid_are_settled_in_place_of_a_fine_tuning():
     assert [type(phase) for phase in as_fitted] == kinds[:-1]
 
 
-@pytest.mark.slow  # the quadruped's example trains such a one
-@pytest.mark.parametrize(("encoder", "p"), [("BearingEncoder", 3), ("TurnedBearingEncoder", 5)])
+@pytest.mark.parametrize(("encoder", "p"), [pytest.param("BearingEncoder", 3, marks=pytest.mark.slow), ("TurnedBearingEncoder", 5)])
 def test_a_grid_with_a_memory_of_actions_trains_and_resumes(tmp_path, encoder, p):
     car = ("env=dubins", f"network.encoder={encoder}", f"network.latent_dim={p}", "network.remember_action=true", "synthesis.gain=0.3",
            "synthesis.choices=3", "synthesis.grid=9", "synthesis.tolerated_error=0.01", "synthesis.tighten_steps=4", "synthesis.teacher=value", "synthesis.rounds=1")  # fmt: skip
