@@ -10,8 +10,7 @@ from torchrl_sspl.baselines import make
 from torchrl_sspl.baselines.data import pooled
 from torchrl_sspl.baselines.pictures import Album, recoloured, shifts
 from torchrl_sspl.baselines.scoring import barrier_on
-from torchrl_sspl.envs import DubinsEnv, PendulumEnv
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.envs import CMUDubinsEnv, CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
 
 
 @pytest.mark.parametrize("side", [64, 128, 256, 96, 40])
@@ -95,9 +94,18 @@ def test_pybullets_pictures_are_nearly_those_of_the_car():
     assert 0 < gap.mean() < 1.0
 
 
-def test_a_system_without_other_pictures_is_refused():
-    with pytest.raises(ConfigError, match="shifted pictures"):
-        shifts(DubinsEnv(obstacle_shape="disc"))
+def test_other_colours_of_cmus_picture_are_those_that_it_draws_itself():
+    env = CMUDubinsEnv([1], image_size=64)
+    state, of = env.state_space.sample(30, torch.Generator().manual_seed(0)), shifts(env)
+    for name, colours in (("background", {"background": (0.0, 1.0, 1.0)}), ("object", {"obstacle_colour": (1.0, 0.0, 1.0)})):
+        drawn = CMUDubinsEnv([1], image_size=64, **colours).draw(state).int()
+        assert (of[name](state).int() - drawn).abs().max() <= 1
+        assert (env.draw(state).int() - drawn).abs().max() > 200
+    assert set(of) == {"dark", "bright", "background", "object"}
+
+
+def test_of_another_system_only_the_brightness_changes():
+    assert set(shifts(CMUTwoDiscsEnv())) == set(shifts(DubinsEnv(obstacle_shape="disc"))) == {"dark", "bright"}
 
 
 def test_a_method_on_states_looks_at_no_picture():

@@ -16,11 +16,11 @@ from torchrl_sspl.baselines.nerf_cbf import NeRFCBF
 from torchrl_sspl.baselines.neural_cbf import QuadraticBarrier
 from torchrl_sspl.baselines.perception import Coordinates, Perception, perception_error
 from torchrl_sspl.baselines.registry import kind_of
-from torchrl_sspl.baselines.scoring import adversarial, harmless, well_inside
+from torchrl_sspl.baselines.scoring import adversarial, harmless, nominals, well_inside
 from torchrl_sspl.baselines.sspl import settings
 from torchrl_sspl.baselines.vision_cbf import Geometry
 from torchrl_sspl.configs import compose
-from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.envs import CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.experiments import Experiment
@@ -70,6 +70,41 @@ def test_every_method_learns_acts_and_is_scored(name, task, systems):
     found = score(method, env, SIZES, kernel=kernel)
     assert found["common_harmless_enter"] is not None
     assert found["latency_p99"] > 0
+    if method.reads == "pixels":  # without a claim there are episodes to ask
+        assert ("shifted_dark_common_harmless_enter" in found.to_dict()) == (claims is None)
+        assert ("shifted_dark_claimed_over_kernel" in found.to_dict()) == (claims is not None)
+
+
+def test_who_claims_nothing_acts_on_shifted_pictures(systems):
+    env, kernel, _ = systems["pendulum"]
+
+    class Afraid(kind_of("imitation")):
+        """Falls over where it sees a cyan corner."""
+
+        def __init__(self):
+            super().__init__(None)
+
+        def act(self, seen, nominal):
+            cyan = (seen[:, 3, 0, 0] < 10)[:, None]
+            own = torch.where(cyan, env.max_action, nominal)
+            return own, torch.zeros(len(seen), dtype=torch.bool)
+
+    found = score(Afraid(), env, ScoreConfig(episodes=4, horizon=30, grid=9, frames=2, shifted=20), kernel=kernel)
+    assert found["shifted_background_common_harmless_enter"] == 1.0
+    assert found["shifted_bright_common_harmless_enter"] == found["common_harmless_enter"]
+
+
+def test_a_system_without_an_adversary_is_scored_under_the_harmless_policy(systems, monkeypatch):
+    assert list(nominals(CMUTwoDiscsEnv())) == ["harmless"]
+    monkeypatch.setattr("torchrl_sspl.baselines.scoring.nominals", lambda env: {"harmless": harmless(env)})
+    env, kernel, _ = systems["pendulum"]
+    method = make("hocbf")
+    method.fit(None, env, BUDGETS["tiny"], 0)
+    found = score(method, env, SIZES, kernel=kernel)
+    assert found["common_harmless_enter"] == 0.0
+    assert found["calibrated_claimed_over_kernel"] > 0.5
+    assert found["common_adversarial_enter"] is None
+    assert "no adversarial nominal policy" in found.measurements["common_adversarial_enter"].note
 
 
 def test_every_method_is_in_the_list_and_learns_or_not():

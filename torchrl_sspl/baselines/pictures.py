@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchrl_sspl.baselines.data import pooled
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
-from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.measurements import Draw
 from torchrl_sspl.runtime.faults import CameraFault
 
@@ -50,21 +50,14 @@ def recoloured(frames: Tensor, old: tuple[int, int, int], new: tuple[int, int, i
 def shifts(env: SafetyEnv) -> dict[str, Draw]:
     """Other pictures of a system by name, states ``(n, s)`` -> frames uint8 ``(n, 3, H, W)``.
 
-    ``renderer``: gymnasium's own of the pendulum, PyBullet's of the car; ``dark`` and ``bright``: a camera of 0.85 and 1.15 times
-    the brightness; ``background``: cyan in place of white; ``object``: the rod blue, the obstacle magenta. Raises ConfigError for
-    another system. Source: none; colours as in LatentSafe's own shifts.
+    ``dark`` and ``bright``: a camera of 0.85 and 1.15 times the brightness. Of the pendulum and the Dubins cars with one obstacle also
+    ``background``: cyan in place of white, and ``object``: the rod blue, the obstacle magenta; ``renderer``: gymnasium's own of the
+    pendulum, PyBullet's of the car with a square obstacle. Source: none; colours as in LatentSafe's own shifts.
 
     Example:
         >>> sorted(shifts(PixelPendulumEnv()))
         ['background', 'bright', 'dark', 'object', 'renderer']
     """
-    if isinstance(env, PixelPendulumEnv):
-        other, old, new, reach = env.renderers()["gymnasium"], _ROD, _BLUE, _BLEND
-    elif isinstance(env, DubinsEnv) and env.obstacle_shape == "square" and env.yaw_lag is None:
-        other, old, new, reach = functools.partial(_bullet, env), _OBSTACLE, _MAGENTA, _NEAR
-    else:
-        raise ConfigError(f"shifted pictures: expected a pendulum or a Dubins car with a square obstacle, received {type(env).__name__}")
-
     def faulty(name: str, strength: float) -> Draw:
         def draw(state: Tensor) -> Tensor:
             frame = env.draw(state)
@@ -72,11 +65,23 @@ def shifts(env: SafetyEnv) -> dict[str, Draw]:
 
         return draw
 
-    return {
-        "renderer": other, "dark": faulty("dark", 0.85), "bright": faulty("bright", 1.15),
-        "background": lambda state: recoloured(env.draw(state), _WHITE, _CYAN, _BLEND),
+    found = {"dark": faulty("dark", 0.85), "bright": faulty("bright", 1.15)}
+    white, blend = _WHITE, _BLEND
+    if isinstance(env, PixelPendulumEnv):
+        found["renderer"] = env.renderers()["gymnasium"]
+        old, new, reach = _ROD, _BLUE, _BLEND
+    elif isinstance(env, CMUDubinsEnv):  # of pure colours
+        white, old = (tuple(round(255 * c) for c in colour) for colour in (env.background, env.obstacle_colour))
+        new, reach, blend = _MAGENTA, 255, 255
+    elif isinstance(env, DubinsEnv) and env.obstacle_shape == "square" and env.yaw_lag is None:
+        found["renderer"] = functools.partial(_bullet, env)
+        old, new, reach = _OBSTACLE, _MAGENTA, _NEAR
+    else:
+        return found
+    return found | {
+        "background": lambda state: recoloured(env.draw(state), white, _CYAN, blend),
         "object": lambda state: recoloured(env.draw(state), old, new, reach),
-    }  # fmt: skip
+    }
 
 
 def _bullet(env: Any, state: Tensor) -> Tensor:

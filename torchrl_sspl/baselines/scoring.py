@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import time
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.evaluation.known import states_where
-from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
+from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
@@ -85,6 +86,20 @@ def adversarial(env: SafetyEnv) -> Nominal:
     raise ConfigError(f"adversary: expected a pendulum or a Dubins car, received {type(env).__name__}; give a nominal policy of your own")
 
 
+def nominals(env: SafetyEnv) -> dict[str, Nominal]:
+    """The nominal policies of the score by name; without the adversarial one for a system whose harm nobody has written down. Source: none.
+
+    Example:
+        >>> from torchrl_sspl.envs import CMUTwoDiscsEnv
+        >>> list(nominals(PixelPendulumEnv())), list(nominals(CMUTwoDiscsEnv()))
+        (['harmless', 'adversarial'], ['harmless'])
+    """
+    found = {"harmless": harmless(env)}
+    with contextlib.suppress(ConfigError):
+        found["adversarial"] = adversarial(env)
+    return found
+
+
 def well_inside(kernel: ViabilityKernel, state: Tensor, cells: int = _RIM) -> Tensor:
     """Whether states ``(n, s)`` and their neighbours some cells away all belong to the kernel, bool ``(n,)``. Source: none.
 
@@ -127,8 +142,12 @@ def barrier_on(method: SafetyMethod, env: SafetyEnv, state: Tensor, album: Album
     return torch.cat(values) if values else torch.zeros(0)
 
 
-def paths(method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal, horizon: int) -> tuple[Guarded, Tensor, Tensor]:
-    """What acted from states ``(n, s)``, ``(n,)`` which of the episodes enter U, and where they went, ``(horizon + 1, n, s)``. Source: none.
+def paths(
+    method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal, horizon: int, draw: Draw | None = None
+) -> tuple[Guarded, Tensor, Tensor]:
+    """What acted from states ``(n, s)``, ``(n,)`` which of the episodes enter U, and where they went, ``(horizon + 1, n, s)``.
+
+    ``draw`` is another camera, ``(n, s)`` -> frames uint8 ``(n, 3, H, W)``; the system's own if not given. Source: none.
 
     Example:
         >>> from torchrl_sspl.baselines import BUDGETS, make
@@ -139,8 +158,8 @@ def paths(method: SafetyMethod, env: SafetyEnv, start: Tensor, nominal: Nominal,
     """
     acts = method.controller(nominal)
     # Each frame is averaged once, not with every observation that holds it.
-    draw = (lambda state: pooled(env.draw(state))) if method.pools else env.draw
-    run = simulate(acts, env, start=start, horizon=horizon, draw=draw)
+    frame = draw or env.draw
+    run = simulate(acts, env, start=start, horizon=horizon, draw=(lambda state: pooled(frame(state))) if method.pools else frame)
     assert run.states is not None
     return acts, ((run.region == UNSAFE) & run.alive).any(0), run.states
 
@@ -155,6 +174,7 @@ class _Score:
     config: ScoreConfig
     out: Evaluation
     album: Album
+    nominals: dict[str, Nominal]
 
     def barrier(self, state: Tensor, shift: str = "") -> Tensor | None:
         return barrier_on(self.method, self.env, state, self.album, shift)
@@ -163,8 +183,8 @@ class _Score:
         value = self.barrier(state)
         return torch.zeros(len(state), dtype=torch.bool) if value is None else value <= 0
 
-    def episodes(self, start: Tensor, nominal: Nominal) -> tuple[Guarded, Tensor, Tensor]:
-        return paths(self.method, self.env, start, nominal, self.config.horizon)
+    def episodes(self, start: Tensor, nominal: str, draw: Draw | None = None) -> tuple[Guarded, Tensor, Tensor]:
+        return paths(self.method, self.env, start, self.nominals[nominal], self.config.horizon, draw)
 
     def starts(self, keep, index: int, n: int) -> Tensor:
         generator = torch.Generator().manual_seed(self.config.seed + index)
@@ -182,7 +202,8 @@ def score(
     its rim of two cells; ``<...>_infeasible`` (of all steps) and ``<...>_deviation`` (mean distance from the nominal
     action); ``calibrated_...`` at the level at which at most one in a thousand other episodes enters U; ``latency_p50`` and
     ``latency_p99``; ``shifted_<name>_...``, the claims of one who reads pictures when these are other ones, see
-    :func:`~torchrl_sspl.baselines.pictures.shifts`. A method that claims nothing is measured from the common set alone.
+    :func:`~torchrl_sspl.baselines.pictures.shifts`. A method that claims nothing is measured from the common set alone, on other
+    pictures, too (``shifted_<name>_common_harmless_enter``). What a system has no adversary or no such picture for is left out.
 
     Args:
         method: fitted.
@@ -210,14 +231,14 @@ def score(
     )  # fmt: skip
     if kernel is None:
         kernel = viability_kernel(env, resolution=sizes_of(env.system.kernel_grid, given.kernel_grid))
-    it = _Score(method, env, kernel, sizes, Evaluation(), album or Album(env))
+    it = _Score(method, env, kernel, sizes, Evaluation(), album or Album(env), nominals(env))
     barrier = _sets(it)
     if barrier is not None:
         _calibrated(it, barrier, _loops(it, "claimed", it.inside, 0))
     _loops(it, "common", lambda x: well_inside(kernel, x), 1)
     _latency(it)
-    if barrier is not None and not on_states and sizes.shifted:
-        _shifted(it)
+    if not on_states and sizes.shifted:
+        _shifted(it) if barrier is not None else _shifted_loops(it)
     return it.out
 
 
@@ -274,13 +295,14 @@ def _loops(it: _Score, name: str, keep, index: int) -> list[tuple[Tensor, Tensor
     """Episodes from a set, under both nominal policies; returns starts and which of them enter U."""
     start = it.starts(keep, index, it.config.episodes)
     found = []
-    for label, make in zip(NOMINALS, (harmless, adversarial), strict=True):
+    for label in NOMINALS:
         key, where = f"{name}_{label}", f"episodes of {it.config.horizon} steps from the {name} set, {label} nominal policy"
-        if not len(start):
-            it.out.missing(f"{key}_enter", f"{key}_infeasible", note=f"the {name} set is empty")
-            it.out.missing(f"{key}_deviation", unit="physical units", note=f"the {name} set is empty")
+        if not len(start) or label not in it.nominals:
+            reason = f"no {label} nominal policy is known for this system" if len(start) else f"the {name} set is empty"
+            it.out.missing(f"{key}_enter", f"{key}_infeasible", note=reason)
+            it.out.missing(f"{key}_deviation", unit="physical units", note=reason)
             continue
-        acts, entered, states = it.episodes(start, make(it.env))
+        acts, entered, states = it.episodes(start, label)
         it.out.count(f"{key}_enter", entered, where)
         if name == "claimed" and bool(entered.any()):  # for a film, of a start that could be kept safe if there is one
             telling = entered & it.kernel.contains(start)
@@ -295,17 +317,17 @@ def _loops(it: _Score, name: str, keep, index: int) -> list[tuple[Tensor, Tensor
 
 def _calibrated(it: _Score, sets: tuple[Tensor, Tensor, Tensor], found: list[tuple[Tensor, Tensor]]) -> None:
     """The same sets and episodes at a level that other episodes have placed."""
-    names = [f"calibrated_{n}_enter" for n in NOMINALS]
-    check = it.starts(it.inside, 2, it.config.check_episodes) if len(found) == 2 else torch.zeros(0)
+    names = [f"calibrated_{n}_enter" for n in it.nominals]
+    check = it.starts(it.inside, 2, it.config.check_episodes) if found else torch.zeros(0)
     if not len(check):  # a set of size zero, which counts in a mean over seeds; of a handful of states starts may be found once and not again
         _count_sets(it.out, "calibrated_", torch.zeros_like(sets[1]), *sets[1:])
         it.out.missing(*names, note="so little is claimed that no episode was found to place a level by" if found else "nothing is claimed")
         return
-    half = check[: len(check) // 2], check[len(check) // 2 :]
-    both = [(x, it.episodes(x, make(it.env))[1]) for x, make in zip(half, (harmless, adversarial), strict=True) if len(x)]
-    value = it.barrier(torch.cat([x for x, _ in both]))
+    shares = zip(check.tensor_split(len(it.nominals)), it.nominals, strict=True)
+    each = [(x, it.episodes(x, label)[1]) for x, label in shares if len(x)]
+    value = it.barrier(torch.cat([x for x, _ in each]))
     assert value is not None
-    level = calibrated_level(value, torch.cat([e for _, e in both]))
+    level = calibrated_level(value, torch.cat([e for _, e in each]))
     it.out.add(Measurement("calibrated_level", level if math.isfinite(level) else None, "barrier", len(value), note="of held-out episodes"))
     barrier, viable, unsafe = sets
     _count_sets(it.out, "calibrated_", barrier <= level, viable, unsafe)
@@ -369,4 +391,15 @@ def _shifted(it: _Score) -> None:
         _count_sets(it.out, f"shifted_{name}_", claimed <= 0, viable, unsafe, independent=True)
 
 
-__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "middles", "paths", "score", "sizes_of", "well_inside"]
+def _shifted_loops(it: _Score) -> None:
+    """Episodes from the common set that see other pictures, of a method that claims nothing."""
+    start = it.starts(lambda x: well_inside(it.kernel, x), 1, it.config.episodes)
+    for name, draw in shifts(it.env).items():
+        key = f"shifted_{name}_common_harmless_enter"
+        try:
+            it.out.count(key, it.episodes(start, "harmless", draw)[1], f"episodes of {it.config.horizon} steps from the common set, other pictures")
+        except MissingDependencyError as error:
+            it.out.missing(key, note=str(error))
+
+
+__all__ = ["ScoreConfig", "adversarial", "barrier_on", "calibrated_level", "harmless", "middles", "nominals", "paths", "score", "sizes_of", "well_inside"]

@@ -180,7 +180,7 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
             episodes = str(first["measurements"].get("common_harmless_enter", {}).get("n"))
             lines.append([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes])
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
-                shifted.append([label, budget, *(" / ".join(_value(good, _moved(c, shift)) for c in _MEASURED[:3]) for shift in _SHIFTS)])
+                shifted.append([label, budget, *(_on_shift(good, shift) for shift in _SHIFTS)])
             facts = ["not counted" if (n := first["needs"].get(key)) is None else str(n) for _, key in _NEEDED]
             minutes = f"{sum(row['minutes']['fit_cpu'] for row in good) / len(good):.1f}"
             if "trials_cpu" in first["minutes"]:
@@ -190,7 +190,7 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
             given.append([label, budget, *facts, minutes, *rests, " ".join("✓" if t == "+" else "✗" for t in ticks) or "-"])
         every[env] = [("Measured", lines), ("Given", given)]
         if len(shifted) > 1:
-            every[env].append(("Shifted pictures: claimed / kernel, false-safe, U called safe", shifted))
+            every[env].append(("Shifted pictures: claimed / kernel, false-safe, U called safe; without a claim: common, harmless", shifted))
     return every
 
 
@@ -214,10 +214,12 @@ def markdown(rows: Sequence[tuple[Cell, Row]]) -> str:
     return "\n".join(text)
 
 
-def _moved(column: tuple[str, str, bool, Any], shift: str) -> tuple[str, str, bool, Any]:
-    """The column of a measurement on shifted pictures."""
-    head, name, share, worst = column
-    return head, f"shifted_{shift}_{name}", share, worst
+def _on_shift(rows: list[dict[str, Any]], shift: str) -> str:
+    """What a method claims on shifted pictures, or what its episodes come to if it claims nothing anywhere."""
+    lost = f"shifted_{shift}_common_harmless_enter"
+    if any(lost in row["measurements"] for row in rows):
+        return f"{_value(rows, ('', lost, True, max))} enter U"
+    return " / ".join(_value(rows, (head, f"shifted_{shift}_{name}", share, worst)) for head, name, share, worst in _MEASURED[:3])
 
 
 def _line(cells_of_row: Sequence[str]) -> str:

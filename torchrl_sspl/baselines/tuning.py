@@ -12,7 +12,7 @@ import torch
 
 from torchrl_sspl.baselines.base import SafetyMethod
 from torchrl_sspl.baselines.registry import kind_of
-from torchrl_sspl.baselines.scoring import NOMINALS, adversarial, barrier_on, harmless, paths
+from torchrl_sspl.baselines.scoring import barrier_on, nominals, paths
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import SSPLError
 
@@ -68,10 +68,11 @@ def merit(method: SafetyMethod, env: SafetyEnv, *, states: int = 400, horizon: i
     value = barrier_on(method, env, start)
     claimed = torch.ones(states, dtype=torch.bool) if value is None else value <= 0
     lost = torch.zeros(states, dtype=torch.bool)
-    for k, make in enumerate((harmless, adversarial)):
-        rows = claimed.nonzero()[:, 0][k :: len(NOMINALS)]
+    wanted = list(nominals(env).values())
+    for k, nominal in enumerate(wanted):
+        rows = claimed.nonzero()[:, 0][k :: len(wanted)]
         if len(rows):
-            lost[rows] = paths(method, env, start[rows], make(env), horizon)[1]
+            lost[rows] = paths(method, env, start[rows], nominal, horizon)[1]
     price = 0.0 if value is None else LOST
     return float(((claimed & ~lost).sum() - price * lost.sum()) / states)
 
