@@ -1,7 +1,7 @@
 """CMU's Dubins car from pixels, scored as latent safety filters were, and on the full grid, in the loop and on shifted pictures.
 
-Run: python benchmarks/cmu_dubins.py RUN_OR_AGENT [RUN_OR_AGENT ...] [--out FILE] [--episodes N] [--shifts 0]
-Prints tables in Markdown and writes one JSON. Positive is "safe". Truth is the viability kernel of ``CMUDubinsEnv``. Their score
+Run: python benchmarks/cmu_dubins.py [RUN_OR_AGENT ...] [--rows DIR ...] [--out FILE] [--episodes N] [--shifts 0]
+``--rows`` are directories of rows of ``python -m torchrl_sspl.baselines METHOD env=cmu``, scored on the cells of their own grid. Prints tables in Markdown and writes one JSON. Positive is "safe". Truth is the viability kernel of ``CMUDubinsEnv``. Their score
 uses 51 x 51 positions at the headings 0 and pi/2; the full grid has 51 headings. An agent sees two frames of a car that
 drove straight on before, and nothing else. Starts of episodes are drawn with a seed of their own.
 """
@@ -14,10 +14,12 @@ import math
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import torchrl_sspl as sspl
+from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE
 from torchrl_sspl.certification.statistics import clopper_pearson
 from torchrl_sspl.envs import CMUDubinsEnv
 from torchrl_sspl.evaluation import simulate
@@ -130,10 +132,21 @@ def row(name: str, s: dict[str, float]) -> str:
     return f"| {name} | {shares} | {told} | {s['f1']:.3f} |"
 
 
+def of_row(directory: Path) -> tuple[str, dict[str, float]]:
+    """Name and scores of a row of the comparison, whose claims lie beside it."""
+    cell = json.loads((directory / ROW_FILE).read_text())["cell"]
+    if cell["env"] != "cmu":
+        raise SystemExit(f"--rows: expected a row of env=cmu, received one of env={cell['env']} in {directory}")
+    with np.load(directory / CLAIMS_FILE) as body:
+        found = scores(*(torch.from_numpy(body[name]) for name in ("claimed", "viable")))
+    return " ".join([cell["method"], *cell["options"], *([f"trials={cell['trials']}"] if cell["trials"] else []), f"seed {cell['seed']}"]), found
+
+
 def main() -> None:
     """Print the tables, write the JSON."""
     asked = argparse.ArgumentParser()
-    asked.add_argument("agents", nargs="+")
+    asked.add_argument("agents", nargs="*")
+    asked.add_argument("--rows", nargs="+", type=Path, default=[])
     asked.add_argument("--out", default="cmu_dubins.json")
     asked.add_argument("--episodes", type=int, default=10_000)
     asked.add_argument("--shifts", type=int, default=20_000, help="uniform states per shift; 0: none")
@@ -141,7 +154,7 @@ def main() -> None:
     env = CMUDubinsEnv([1], seed=SEED)
     kernel = viability_kernel(env, resolution=env.system.kernel_grid)
     theirs, full = slices(env), env.state_space.grid((NODES,) * 3)  # type: ignore[attr-defined]
-    body: dict[str, Any] = {"unsafe share of the grid": float((~kernel.contains(full)).float().mean()), "published": PUBLISHED, "agents": {}}
+    body: dict[str, Any] = {"unsafe share of the grid": float((~kernel.contains(full)).float().mean()), "published": PUBLISHED, "agents": {}, "rows": {}}
     print("| method, states | tp | tn | fp | fn | recall | unsafe called safe | precision | balanced accuracy | F1 |\n|---|---|---|---|---|---|---|---|---|---|")
     print(row("LatentSafe, published, two headings", rates(*PUBLISHED["nominal"])))
     print(row('"only the disc is unsafe", full grid', scores(~env.unsafe_set.contains(full), kernel.contains(full))))
@@ -154,6 +167,10 @@ def main() -> None:
             found[label] = scores(value <= 0, kernel.contains(states))
             print(row(f"{name}, {label}", found[label]), flush=True)
         found["training ended"] = agent.description.get("stop_reason", "")
+    for directory in given.rows:
+        name, found = of_row(directory)
+        body["rows"][name] = found
+        print(row(f"{name}, its grid", found), flush=True)
     for name, found in body["agents"].items():
         agent = sspl.load(name)
         found["in the loop"] = in_the_loop(agent, env, kernel, given.episodes) if given.episodes else {}

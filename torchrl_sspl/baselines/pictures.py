@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from hashlib import sha256
 from typing import Any
 
@@ -71,7 +71,7 @@ def shifts(env: SafetyEnv) -> dict[str, Draw]:
         found["renderer"] = env.renderers()["gymnasium"]
         old, new, reach = _ROD, _BLUE, _BLEND
     elif isinstance(env, CMUDubinsEnv):  # of pure colours
-        white, old = (tuple(round(255 * c) for c in colour) for colour in (env.background, env.obstacle_colour))
+        white, old = _grey_levels(env.background), _grey_levels(env.obstacle_colour)
         new, reach, blend = _MAGENTA, 255, 255
     elif isinstance(env, DubinsEnv) and env.obstacle_shape == "square" and env.yaw_lag is None:
         found["renderer"] = functools.partial(_bullet, env)
@@ -82,6 +82,11 @@ def shifts(env: SafetyEnv) -> dict[str, Draw]:
         "background": lambda state: recoloured(env.draw(state), white, _CYAN, blend),
         "object": lambda state: recoloured(env.draw(state), old, new, reach),
     }
+
+
+def _grey_levels(colour: Sequence[float]) -> tuple[int, int, int]:
+    red, green, blue = (round(255 * c) for c in colour)
+    return red, green, blue
 
 
 def _bullet(env: Any, state: Tensor) -> Tensor:
