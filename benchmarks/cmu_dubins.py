@@ -139,7 +139,7 @@ def of_row(directory: Path) -> tuple[str, dict[str, float]]:
         raise SystemExit(f"--rows: expected a row of env=cmu, received one of env={cell['env']} in {directory}")
     with np.load(directory / CLAIMS_FILE) as body:
         found = scores(*(torch.from_numpy(body[name]) for name in ("claimed", "viable")))
-    return " ".join([cell["method"], *cell["options"], *([f"trials={cell['trials']}"] if cell["trials"] else []), f"seed {cell['seed']}"]), found
+    return " ".join([cell["method"], *cell["options"], *([f"trials={cell['trials']}"] if cell.get("trials") else []), f"seed {cell['seed']}"]), found
 
 
 def main() -> None:
