@@ -100,9 +100,9 @@ def test_a_recording_holds_what_was_asked_for():
 def test_as_many_episodes_place_the_level_as_were_asked_for_under_both_nominal_policies(n, monkeypatch):
     blocks, whole = [], scoring.paths
 
-    def counted(method, env, start, nominal, horizon):
+    def counted(method, env, start, nominal, horizon, draw=None):
         blocks.append((len(start), bool((nominal(torch.ones(1, 2)) != 0).any())))
-        return whole(method, env, start, nominal, horizon)
+        return whole(method, env, start, nominal, horizon, draw)
 
     monkeypatch.setattr(scoring, "paths", counted)
     env, method = PendulumEnv(), make("lqr")
