@@ -1,7 +1,8 @@
 """CMU's Dubins car from pixels, scored as latent safety filters were, and on the full grid, in the loop and on shifted pictures.
 
 Run: python benchmarks/cmu_dubins.py [RUN_OR_AGENT ...] [--rows DIR ...] [--out FILE] [--episodes N] [--shifts 0]
-``--rows`` are directories of rows of ``python -m torchrl_sspl.baselines METHOD env=cmu``, scored on the cells of their own grid. Prints tables in Markdown and writes one JSON. Positive is "safe". Truth is the viability kernel of ``CMUDubinsEnv``. Their score
+Prints tables in Markdown and writes one JSON. ``--rows`` are directories of rows of ``python -m torchrl_sspl.baselines METHOD
+env=cmu``, scored on the cells of their own grid. Positive is "safe". Truth is the viability kernel of ``CMUDubinsEnv``. Their score
 uses 51 x 51 positions at the headings 0 and pi/2; the full grid has 51 headings. An agent sees two frames of a car that
 drove straight on before, and nothing else. Starts of episodes are drawn with a seed of their own.
 """
@@ -19,7 +20,8 @@ import torch
 from torch import Tensor
 
 import torchrl_sspl as sspl
-from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE
+from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell
+from torchrl_sspl.baselines.table import name_of
 from torchrl_sspl.certification.statistics import clopper_pearson
 from torchrl_sspl.envs import CMUDubinsEnv
 from torchrl_sspl.evaluation import simulate
@@ -139,7 +141,8 @@ def of_row(directory: Path) -> tuple[str, dict[str, float]]:
         raise SystemExit(f"--rows: expected a row of env=cmu, received one of env={cell['env']} in {directory}")
     with np.load(directory / CLAIMS_FILE) as body:
         found = scores(*(torch.from_numpy(body[name]) for name in ("claimed", "viable")))
-    return " ".join([cell["method"], *cell["options"], *([f"trials={cell['trials']}"] if cell.get("trials") else []), f"seed {cell['seed']}"]), found
+    name = name_of(Cell(cell["method"], options=tuple(cell["options"]), trials=cell.get("trials", 0)))
+    return f"{name} seed {cell['seed']}", found
 
 
 def main() -> None:
