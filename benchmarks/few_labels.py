@@ -10,11 +10,14 @@ Of ``transitions``, recorded under random actions with 15 % of the episodes star
 kind are labelled, those that come first (with ``labels.share=0.1`` each with that chance, until there are as many); the rest is unlabelled, but for ``labels.choose=400`` of it that are chosen on latents. ``starts=[0,0.5,0.5]`` with
 ``collector.max_frames_per_traj=1`` records nothing without a label. The level of the set is placed by held-out episodes with labels of their
 own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``; ``figure`` draws all points that there are,
-over the number of labels and over that of the transitions, in ``few_labels.png``.
+over the number of labels and over that of the transitions, in ``few_labels.png``, and writes them into ``few_labels.csv``: with ``out=docs/images`` it draws the documentation's.
+The quadruped's are runs of their own, ``sspl train env=quadruped out_dir=runs/few_labels/quadruped/NAME``, which ``figure`` reads as well.
 """
 
 from __future__ import annotations
 
+import csv
+import io
 import itertools
 import json
 import statistics
@@ -23,7 +26,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -37,11 +40,44 @@ from torchrl_sspl.files import RunDirectory, write
 from torchrl_sspl.viz.plane import PATH_COLOURS, new_figure
 
 LISTS = {"labels": "100,300,1000,all", "transitions": "20000", "wrong": "0", "seed": "0,1,2"}
+DATA = "few_labels.csv"
 STARTS = "[0.6,0.15,0.25]"  # shares of the episodes: anywhere or outside U, in S, in U
 COLUMNS = (
     ("volume / kernel", "claimed_over_kernel"), ("false-safe", "false_safe"), ("U called safe", "unsafe_called_safe"),
     ("claimed, enter U", "claimed_harmless_enter"), ("common, enter U", "common_harmless_enter"),
 )  # fmt: skip
+
+
+class Line(NamedTuple):
+    """A point as a line of the data; the first six say which one it is."""
+
+    env: str
+    labels: str  # that come first, of each kind at most, or "all"
+    transitions: int  # asked for
+    wrong: float
+    seed: int
+    options: str
+    passed: int
+    labelled: int  # of S, of U and of neither, in all
+    claimed_over_kernel: float | None
+    false_safe: float | None
+    unsafe_called_safe: float | None
+    claimed_harmless_enter: float | None
+    common_harmless_enter: float | None
+
+    @classmethod
+    def read(cls, row: dict[str, str]) -> Line:
+        """A line of what :func:`figure` has written."""
+        kinds = (str, str, int, float, int, str, int, int)
+        shares = [float(row[name]) if row[name] else None for _, name in COLUMNS]
+        return cls(*(kind(row[name]) for kind, name in zip(kinds, cls._fields[:8], strict=True)), *shares)
+
+    @property
+    def how(self) -> str:
+        """Options in words, as a legend needs them."""
+        words = {"labels.choose": "{} labels chosen", "labels.share": "at random, a chance of {}"}
+        pairs = (option.partition("=")[::2] for option in self.options.split())
+        return "".join(f", {words.get(key, f'{key}={{}}').format(value)}" for key, value in pairs)
 
 
 @dataclass(frozen=True)
@@ -109,50 +145,92 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+def line_of(row: dict[str, Any]) -> Line:
+    """What figure and data tell of a measured point."""
+    options = [*row["options"], *([] if tuple(row["starts"]) == Point.starts else [f"starts={list(row['starts'])}".replace(" ", "")])]
+    known = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
+    measured = [_rounded(row["measurements"][name]["value"]) for _, name in COLUMNS]
+    return Line(row["env"], str(row["labels"]), row["transitions"], row["wrong"], row["seed"], " ".join(options), int(row["passed"]), known, *measured)
+
+
+def _rounded(share: float | None) -> float | None:
+    return None if share is None else round(share, 6)
+
+
+def line_of_run(env: str, found: dict[str, Any]) -> Line:
+    """The same of the ``metrics.json`` of a run, which scores itself: so the quadruped's points are measured."""
+    config, own = found["config"], found["measurements"]["own"]
+    labels = config["labels"]
+    options = [f"labels.{name}={labels[name]}" for name, usual in (("choose", 0), ("share", 1.0)) if labels[name] != usual]
+    known = sum(count for name, count in found["budget"].items() if name.startswith(("labels of", "chosen labels of")))
+    measured = [_rounded(own[name]["value"]) for name in ("volume_over_kernel", "false_safe", "unsafe_called_safe", "safe_rollouts_touch_unsafe")]
+    passed = any(check["passed"] for check in found["checks"])
+    first = "all" if labels["safe"] is None else str(labels["safe"])
+    return Line(env, first, found["budget"]["transitions"], labels["wrong"], found["seed"], " ".join(options), int(passed), known, *measured, None)
+
+
+def gathered(out: Path) -> list[Line]:
+    """A line for every point below ``out``: of the data there, of points, and of runs in a folder of their system's name.
+
+    What is measured counts before the data; a ConfigError if two runs are the same point.
+    """
+    lines = [line_of(json.loads(path.read_text())) for path in sorted(out.rglob("point.json"))]
+    lines += [line_of_run(path.relative_to(out).parts[0], json.loads(path.read_text())) for path in sorted(out.glob("*/*/metrics.json"))]
+    found = dict[tuple[Any, ...], Line]()
+    for line in lines:
+        if line[:6] in found:
+            raise ConfigError(f"figure: expected each point once below '{out}', found two of {dict(zip(Line._fields[:6], line[:6], strict=True))}; move one of them away")
+        found[line[:6]] = line
+    if (out / DATA).is_file():
+        told = (Line.read(row) for row in csv.DictReader((out / DATA).read_text().splitlines()))
+        found = {line[:6]: line for line in told} | found
+    return sorted(found.values(), key=lambda line: (line.env, line.wrong, line.options, line.transitions, line.labels == "all", line.labels.zfill(9), line.seed))
+
+
 def figure(out: Path) -> Path:
     """Draws volume, share of U called safe and false-safe share of all points below ``out`` with right labels, two panels for each system.
 
-    The left one has those of the number of transitions that most points have. Returns the picture.
+    The left one has those of the number of transitions that most points have. Writes a line for every point into ``few_labels.csv`` beside the
+    picture, and reads what is there: it draws the same without the points. Returns the picture.
     """
-    rows = [json.loads(path.read_text()) for path in sorted(out.rglob("point.json"))]
-    rows = [row for row in rows if not row["wrong"] and tuple(row["starts"]) == Point.starts]
-    if not rows:
+    lines = gathered(out)
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows([Line._fields, *lines])
+    lines = [line for line in lines if not line.wrong and "starts=" not in line.options]
+    if not lines:
         raise ConfigError(f"figure: expected measured points below '{out}', found none; run the benchmark first")
-    words = {"labels.choose": "{} labels chosen", "labels.share": "at random, a chance of {}"}
-    for row in rows:
-        row["labels known"] = sum(row["needs"][k] for k in ("safe_labels", "unsafe_labels", "neither_labels"))
-        pairs = (o.partition("=")[::2] for o in row["options"])
-        row["how"] = "".join(f", {words.get(key, f'{key}={{}}').format(value)}" for key, value in pairs)
+    write(out / DATA, text.getvalue())
 
-    def labels_of(row: dict[str, Any]) -> str:
-        return f"{row['labels']} labels of S and of U{row['how']}"
+    def labels_of(line: Line) -> str:
+        return f"{line.labels} labels of S and of U{line.how}"
 
-    systems = sorted({row["env"] for row in rows})
+    systems = sorted({line.env for line in lines})
     drawn = new_figure(9, 2.9 * len(systems))
     for env, (left, right) in zip(systems, drawn.subplots(len(systems), 2, squeeze=False), strict=True):
-        of_env = [row for row in rows if row["env"] == env]
-        usual = statistics.mode(row["transitions"] for row in of_env)
-        _panel(left, [row for row in of_env if row["transitions"] == usual], "labels known", "labels", lambda row: f"{row['transitions']:,} transitions{row['how']}")
-        several = [row for row in of_env if len({r["transitions"] for r in of_env if labels_of(r) == labels_of(row)}) > 1]
+        of_env = [line for line in lines if line.env == env]
+        usual = statistics.mode(line.transitions for line in of_env)
+        _panel(left, [line for line in of_env if line.transitions == usual], "labelled", "labels", lambda line: f"{line.transitions:,} transitions{line.how}")
+        several = [line for line in of_env if len({r.transitions for r in of_env if labels_of(r) == labels_of(line)}) > 1]
         _panel(right, several, "transitions", "transitions", labels_of)
         left.set(xlabel="labelled pictures", ylabel="%", title=env)
         right.set(xlabel="transitions", title=env)
+        right.set_visible(bool(several))
     drawn.suptitle("Solid, discs: volume over that of the kernel. Dashed, triangles: share of U called safe. Dotted, squares: false-safe share. Filled: held-out checks pass.", fontsize=8)
     path = out / "few_labels.png"
     drawn.savefig(path, dpi=150)
     return path
 
 
-def _panel(ax: Any, rows: list[dict[str, Any]], x: str, place: str, name: Callable[[dict[str, Any]], str]) -> None:
+def _panel(ax: Any, lines: list[Line], x: str, place: str, name: Callable[[Line], str]) -> None:
     """One mark for each training over ``x``, and lines through the means of those that share a name and a place."""
-    names, ticks = sorted({name(row) for row in rows}), set[int]()
+    names, ticks = sorted({name(line) for line in lines}), set[int]()
     for colour, label in zip(itertools.cycle(PATH_COLOURS), names):
         for measure, mark, style in (("claimed_over_kernel", "o", "-"), ("unsafe_called_safe", "^", "--"), ("false_safe", "s", ":")):
             groups: dict[Any, list[tuple[float, float]]] = {}
-            for row in (row for row in rows if name(row) == label and row["measurements"][measure]["value"] is not None):
-                at = row[x], 100 * row["measurements"][measure]["value"]
-                groups.setdefault(row[place], []).append(at)
-                ax.plot(*at, mark, color=colour, markerfacecolor=colour if row["passed"] else "white", markersize=5)
+            for line in (line for line in lines if name(line) == label and getattr(line, measure) is not None):
+                at = getattr(line, x), 100 * getattr(line, measure)
+                groups.setdefault(getattr(line, place), []).append(at)
+                ax.plot(*at, mark, color=colour, markerfacecolor=colour if line.passed else "white", markersize=5)
             means = np.array(sorted(tuple(np.mean(of, 0)) for of in groups.values())).reshape(-1, 2)
             ax.plot(*means.T, style, color=colour, label=label if style == "-" else None)
             ticks.update(round(mean) for mean in means[:, 0])

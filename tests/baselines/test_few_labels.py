@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import runpy
 import sys
@@ -50,14 +51,28 @@ def test_every_point_is_measured_once_and_says_how_many_labels_it_had(tmp_path, 
     assert [path.stat().st_mtime_ns for path in sorted(tmp_path.rglob("point.json"))] == before
 
 
-def point(out: Path, labels: str, transitions: int, volume: float | None, *, passed: bool, wrong: float = 0.0, options: tuple[str, ...] = ()) -> None:
-    path = out / f"{labels}-{transitions}-{wrong}-{len(options)}" / "point.json"
+def point(
+    out: Path, labels: str, transitions: int, volume: float | None, *, passed: bool, wrong: float = 0.0, options: tuple[str, ...] = (), starts: tuple[float, ...] = (0.6, 0.15, 0.25)
+) -> None:
+    path = out / f"{labels}-{transitions}-{wrong}-{len(options)}-{starts[0]}" / "point.json"
     path.parent.mkdir(parents=True)
     counts = {"safe_labels": 100, "unsafe_labels": 100, "neither_labels": 0}
-    measured = {"claimed_over_kernel": {"value": volume}, "false_safe": {"value": None}, "unsafe_called_safe": {"value": 0.1}}
+    others = {"false_safe": {"value": None}, "unsafe_called_safe": {"value": 0.1}, "claimed_harmless_enter": {"value": None}, "common_harmless_enter": {"value": 0.0}}
     path.write_text(json.dumps({
-        "env": "pendulum", "labels": labels, "transitions": transitions, "wrong": wrong, "seed": 0, "options": options, "starts": [0.6, 0.15, 0.25],
-        "passed": passed, "needs": counts, "measurements": measured,
+        "env": "pendulum", "labels": labels, "transitions": transitions, "wrong": wrong, "seed": 0, "options": options, "starts": starts,
+        "passed": float(passed), "needs": counts, "measurements": {"claimed_over_kernel": {"value": volume}, **others},
+    }))  # fmt: skip
+
+
+def run(out: Path, volume: float, **changes: object) -> None:
+    """What ``sspl train`` writes, as far as a point needs it."""
+    own = {"volume_over_kernel": volume, "false_safe": 0.0, "unsafe_called_safe": 0.0, "safe_rollouts_touch_unsafe": 0.0}
+    path = out / "metrics.json"
+    path.parent.mkdir(parents=True)
+    path.write_text(json.dumps({
+        "config": {"labels": {"safe": 100, "unsafe": 100, "choose": 400, "share": 1.0, "wrong": 0.0} | changes}, "seed": 3,
+        "budget": {"transitions": 20_000, "labels of S": 100, "labels of U": 100, "chosen labels of U": 160, "chosen labels of neither": 240, "held-out pictures with a label": 9},
+        "checks": [{"passed": False}, {"passed": True}], "measurements": {"own": {name: {"value": value} for name, value in own.items()}},
     }))  # fmt: skip
 
 
@@ -81,6 +96,57 @@ def test_the_figure_shows_every_training_and_which_of_them_pass(tmp_path, monkey
     assert named == ["20,000 transitions", "20,000 transitions, 40 labels chosen", "20,000 transitions, 40 labels chosen, synthesis.guard=0.02"]
     # Those of which 40 labels are chosen have one number of transitions.
     assert [text.get_text() for text in right.get_legend().get_texts()] == ["100 labels of S and of U"]
+
+
+def test_the_data_beside_the_figure_draws_it_again_and_takes_what_is_measured_later(tmp_path):
+    figure = runpy.run_path(str(BENCHMARK))["figure"]
+    point(tmp_path / "a", "100", 20_000, 1 / 3, passed=True, options=("labels.choose=40", "x=[1,2]"))
+    point(tmp_path / "a", "all", 640, None, passed=False, starts=(0.0, 0.5, 0.5))
+    run(tmp_path / "a" / "quadruped" / "few", 0.9)
+    picture = figure(tmp_path / "a").read_bytes()
+    data = (tmp_path / "a" / "few_labels.csv").read_text()
+    assert data.splitlines()[1:] == [
+        'pendulum,100,20000,0.0,0,"labels.choose=40 x=[1,2]",1,200,0.333333,,0.1,,0.0',
+        'pendulum,all,640,0.0,0,"starts=[0.0,0.5,0.5]",0,200,,,0.1,,0.0',
+        "quadruped,100,20000,0.0,3,labels.choose=400,1,600,0.9,0.0,0.0,0.0,",
+    ]
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "few_labels.csv").write_text(data)
+    assert figure(tmp_path / "b").read_bytes() == picture
+    assert (tmp_path / "b" / "few_labels.csv").read_text() == data
+    run(tmp_path / "b" / "quadruped" / "again", 0.8)
+    run(tmp_path / "b" / "quadruped" / "all", 0.95, safe=None, unsafe=None, choose=0)
+    figure(tmp_path / "b")
+    assert [line[:39] for line in (tmp_path / "b" / "few_labels.csv").read_text().splitlines()[3:]] == [
+        "quadruped,all,20000,0.0,3,,1,600,0.95,0", "quadruped,100,20000,0.0,3,labels.choose",
+    ]  # fmt: skip
+    assert ",0.8,0.0,0.0,0.0," in (tmp_path / "b" / "few_labels.csv").read_text()
+    run(tmp_path / "b" / "quadruped" / "twice", 0.7)
+    with pytest.raises(ConfigError, match=r"expected each point once .*'labels.choose=400'.*move one of them away"):
+        figure(tmp_path / "b")
+
+
+def test_the_table_of_the_documentation_is_that_of_its_data():
+    docs = BENCHMARK.parents[1] / "docs"
+    lines = list(csv.DictReader((docs / "images" / "few_labels.csv").read_text().splitlines()))
+    table = (docs / "comparison.md").read_text().partition("| system | first | chosen | transitions | wrong | checks passed |")[2].partition("\n\n")[0]
+    rows = [[cell.strip() for cell in row.strip("|").split("|")] for row in table.splitlines()[2:]]
+    assert len(rows) > 15
+    for system, first, chosen, transitions, wrong, passed, *shares in rows:
+        options = {"400": "labels.choose=400", "-": "labels.share=0.1" if "at random" in first else ""}[chosen]
+        point = {
+            "env": {"Dubins car": "dubins"}.get(system, system), "labels": first.partition(",")[0], "transitions": transitions.replace(",", ""), "wrong": f"{float(wrong)}",
+            "options": options if transitions != "640" else "collector.max_frames_per_traj=1 starts=[0.0,0.5,0.5]",
+        }  # fmt: skip
+        found = [line for line in lines if point.items() <= line.items()]
+        assert [line["seed"] for line in found] == [str(seed) for seed in range(len(found))]
+        assert passed == f"{sum(int(line['passed']) for line in found)} of {len(found)}", point
+        names = ("claimed_over_kernel", "false_safe", "unsafe_called_safe", "claimed_harmless_enter", "common_harmless_enter")
+        for name, cell in zip(names, shares, strict=True):
+            scale = 200 if name == "claimed_harmless_enter" else 100
+            measured = [scale * float(line[name]) for line in found]
+            shown = cell.split(", ")
+            assert [float(value) for value in shown] == pytest.approx(measured, abs=0.051), (point, name)
 
 
 def test_a_figure_of_nothing_is_refused(tmp_path):
