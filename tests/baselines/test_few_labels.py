@@ -64,18 +64,6 @@ def point(
     }))  # fmt: skip
 
 
-def run(out: Path, volume: float, **changes: object) -> None:
-    """What ``sspl train`` writes, as far as a point needs it."""
-    own = {"volume_over_kernel": volume, "false_safe": 0.0, "unsafe_called_safe": 0.0, "safe_rollouts_touch_unsafe": 0.0}
-    path = out / "metrics.json"
-    path.parent.mkdir(parents=True)
-    path.write_text(json.dumps({
-        "config": {"labels": {"safe": 100, "unsafe": 100, "choose": 400, "share": 1.0, "wrong": 0.0} | changes}, "seed": 3,
-        "budget": {"transitions": 20_000, "labels of S": 100, "labels of U": 100, "chosen labels of U": 160, "chosen labels of neither": 240, "held-out pictures with a label": 9},
-        "checks": [{"passed": False}, {"passed": True}], "measurements": {"own": {name: {"value": value} for name, value in own.items()}},
-    }))  # fmt: skip
-
-
 def test_the_figure_shows_every_training_and_which_of_them_pass(tmp_path, monkeypatch, capsys):
     point(tmp_path, "100", 20_000, 0.5, passed=True)
     point(tmp_path, "all", 20_000, 0.7, passed=False)
@@ -100,30 +88,29 @@ def test_the_figure_shows_every_training_and_which_of_them_pass(tmp_path, monkey
 
 def test_the_data_beside_the_figure_draws_it_again_and_takes_what_is_measured_later(tmp_path):
     figure = runpy.run_path(str(BENCHMARK))["figure"]
-    point(tmp_path / "a", "100", 20_000, 1 / 3, passed=True, options=("labels.choose=40", "x=[1,2]"))
-    point(tmp_path / "a", "all", 640, None, passed=False, starts=(0.0, 0.5, 0.5))
-    run(tmp_path / "a" / "quadruped" / "few", 0.9)
-    picture = figure(tmp_path / "a").read_bytes()
-    data = (tmp_path / "a" / "few_labels.csv").read_text()
+    first, second = tmp_path / "first", tmp_path / "second"
+    point(first, "100", 20_000, 1 / 3, passed=True, options=("labels.choose=40", "x=[1,2]"))
+    point(first, "all", 640, None, passed=False, starts=(0.0, 0.5, 0.5))
+    picture = figure(first).read_bytes()
+    data = (first / "few_labels.csv").read_text()
     assert data.splitlines()[1:] == [
         'pendulum,100,20000,0.0,0,"labels.choose=40 x=[1,2]",1,200,0.333333,,0.1,,0.0',
         'pendulum,all,640,0.0,0,"starts=[0.0,0.5,0.5]",0,200,,,0.1,,0.0',
-        "quadruped,100,20000,0.0,3,labels.choose=400,1,600,0.9,0.0,0.0,0.0,",
     ]
-    (tmp_path / "b").mkdir()
-    (tmp_path / "b" / "few_labels.csv").write_text(data)
-    assert figure(tmp_path / "b").read_bytes() == picture
-    assert (tmp_path / "b" / "few_labels.csv").read_text() == data
-    run(tmp_path / "b" / "quadruped" / "again", 0.8)
-    run(tmp_path / "b" / "quadruped" / "all", 0.95, safe=None, unsafe=None, choose=0)
-    figure(tmp_path / "b")
-    assert [line[:39] for line in (tmp_path / "b" / "few_labels.csv").read_text().splitlines()[3:]] == [
-        "quadruped,all,20000,0.0,3,,1,600,0.95,0", "quadruped,100,20000,0.0,3,labels.choose",
-    ]  # fmt: skip
-    assert ",0.8,0.0,0.0,0.0," in (tmp_path / "b" / "few_labels.csv").read_text()
-    run(tmp_path / "b" / "quadruped" / "twice", 0.7)
-    with pytest.raises(ConfigError, match=r"expected each point once .*'labels.choose=400'.*move one of them away"):
-        figure(tmp_path / "b")
+    second.mkdir()
+    (second / "few_labels.csv").write_text(data)
+    assert figure(second).read_bytes() == picture
+    assert (second / "few_labels.csv").read_text() == data
+    point(second, "100", 20_000, 0.5, passed=False, options=("labels.choose=40", "x=[1,2]"))
+    point(second, "all", 20_000, 0.75, passed=True)
+    point(second, "1000", 20_000, 0.25, passed=True)
+    figure(second)
+    assert (second / "few_labels.csv").read_text().splitlines()[1:] == [
+        "pendulum,1000,20000,0.0,0,,1,200,0.25,,0.1,,0.0",
+        "pendulum,all,20000,0.0,0,,1,200,0.75,,0.1,,0.0",
+        'pendulum,100,20000,0.0,0,"labels.choose=40 x=[1,2]",0,200,0.5,,0.1,,0.0',
+        'pendulum,all,640,0.0,0,"starts=[0.0,0.5,0.5]",0,200,,,0.1,,0.0',
+    ]
 
 
 def test_the_table_of_the_documentation_is_that_of_its_data():
@@ -152,6 +139,23 @@ def test_the_table_of_the_documentation_is_that_of_its_data():
 def test_a_figure_of_nothing_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="expected measured points"):
         runpy.run_path(str(BENCHMARK))["figure"](tmp_path)
+
+
+def test_the_quadruped_is_a_run_that_scores_itself(tmp_path, monkeypatch, capsys):
+    small = [*SHORT, "env.image_size=32", "network.pool_to=16", "synthesis.retries=0", "synthesis.grid=9", "synthesis.turns=4", "buffer.batch=24", "trainer.optim_steps_per_batch=1"]
+    words = ["env=quadruped", "labels=20", "labels.choose=20", "transitions=640", "seed=0", f"out={tmp_path}", *SIZES, *small]
+    start(monkeypatch, *words)
+    printed = capsys.readouterr().out
+    (row,) = json.loads((tmp_path / "points.json").read_text())
+    assert row["needs"]["safe_labels"] + row["needs"]["unsafe_labels"] + row["needs"]["neither_labels"] <= 60
+    assert row["needs"]["rollouts"] == 128
+    assert row["measurements"]["claimed_over_kernel"]["name"] == "volume_over_kernel"
+    assert row["measurements"]["claimed_harmless_enter"]["n"] in (0, 4)
+    assert printed.splitlines()[-1].endswith("| - |")
+    start(monkeypatch, *words)
+    assert capsys.readouterr().out == printed
+    with pytest.raises(ConfigError, match="starts: expected none with env=quadruped"):
+        start(monkeypatch, *words, "starts=[0,0.5,0.5]")
 
 
 @pytest.mark.slow

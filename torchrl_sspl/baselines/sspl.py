@@ -8,8 +8,8 @@ episodes that start in S or U some leave it. The agent's policy acts by itself; 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import torch
@@ -73,6 +73,23 @@ def settings(system: str, budget: Budget) -> list[str]:
     ]  # fmt: skip
 
 
+def needs_of(counted: Mapping[str, int]) -> Needs:
+    """What a training was given, from the counts that it keeps of its data.
+
+    Source: none.
+
+    Example:
+        >>> needs_of({"transitions": 640, "labels of S": 100, "chosen labels of S": 7, "chosen labels of neither": 20}).safe_labels
+        107
+    """
+    labels = {name: sum(counted.get(f"{how} of {name}", 0) for how in ("labels", "chosen labels")) for name in ("S", "U", "neither")}
+    return Needs(
+        transitions=counted.get("transitions", 0), safe_labels=labels["S"], unsafe_labels=labels["U"], neither_labels=labels["neither"],
+        rollouts=counted.get("transitions of rollouts"),
+        held_out_labels=counted.get("held-out pictures with a label"), held_out_steps=counted.get("held-out steps with a label"),
+    )  # fmt: skip
+
+
 @dataclass
 class SSPLConfig:
     """Options of this library's own row."""
@@ -103,13 +120,7 @@ class SSPL(SafetyMethod):
         else:
             self.agent, counted = self._train(env, budget, seed)
         proved = "invariance in the learned latent dynamics" if self.agent.tolerated_error > 0 else "the barrier's Lipschitz constant"
-        labels = {name: sum(counted.get(f"{how} of {name}", 0) for how in ("labels", "chosen labels")) for name in ("S", "U", "neither")}
-        self.needs = Needs(
-            transitions=counted.get("transitions", 0), safe_labels=labels["S"], unsafe_labels=labels["U"], neither_labels=labels["neither"],
-            rollouts=counted.get("transitions of rollouts"),
-            held_out_labels=counted.get("held-out pictures with a label"), held_out_steps=counted.get("held-out steps with a label"),
-            proved=proved, measured="level and round, on held-out episodes", claimed="invariance of {B <= 0}",
-        )  # fmt: skip
+        self.needs = replace(needs_of(counted), proved=proved, measured="level and round, on held-out episodes", claimed="invariance of {B <= 0}")
         shield = None
         if self.config.filter:
             margin = None if self.agent.tolerated_error > 0 else UNPROVED_MARGIN
