@@ -60,18 +60,18 @@ def slices(env: CMUDubinsEnv) -> Tensor:
     return states
 
 
-def scores(called: Tensor, safe: Tensor) -> dict[str, float]:
+def scores(called: Tensor, safe: Tensor) -> dict[str, Any]:
     """Shares and rates of states that are called safe."""
     found = {"tp": called & safe, "tn": ~called & ~safe, "fp": called & ~safe, "fn": ~called & safe}
     return rates(*(float(v.float().mean()) for v in found.values()))
 
 
-def rates(tp: float, tn: float, fp: float, fn: float) -> dict[str, float]:
-    """What follows from the four shares."""
+def rates(tp: float, tn: float, fp: float, fn: float) -> dict[str, Any]:
+    """What follows from the four shares; None where nothing is called safe."""
     recall, miss = tp / (tp + fn), fp / (fp + tn)
     return {
         "tp": tp, "tn": tn, "fp": fp, "fn": fn, "accuracy": tp + tn, "balanced_accuracy": (recall + 1 - miss) / 2,
-        "precision": tp / (tp + fp) if tp + fp else math.nan, "recall": recall, "unsafe_called_safe": miss,
+        "precision": tp / (tp + fp) if tp + fp else None, "recall": recall, "unsafe_called_safe": miss,
         "f1": 2 * tp / (2 * tp + fp + fn),
     }  # fmt: skip
 
@@ -127,14 +127,14 @@ def on_shifts(agent: Agent, kernel: ViabilityKernel, n: int) -> dict[str, Any]:
     return found
 
 
-def row(name: str, s: dict[str, float]) -> str:
+def row(name: str, s: dict[str, Any]) -> str:
     """A row of the first table."""
     shares = " | ".join(f"{s[k]:.3f}" for k in ("tp", "tn", "fp", "fn"))
-    told = " | ".join(f"{100 * s[k]:.1f} %" for k in ("recall", "unsafe_called_safe", "precision", "balanced_accuracy"))
+    told = " | ".join("-" if s[k] is None else f"{100 * s[k]:.1f} %" for k in ("recall", "unsafe_called_safe", "precision", "balanced_accuracy"))
     return f"| {name} | {shares} | {told} | {s['f1']:.3f} |"
 
 
-def of_row(directory: Path) -> tuple[str, dict[str, float]]:
+def of_row(directory: Path) -> tuple[str, dict[str, Any]]:
     """Name and scores of a row of the comparison, whose claims lie beside it."""
     cell = json.loads((directory / ROW_FILE).read_text())["cell"]
     if cell["env"] != "cmu":
@@ -142,7 +142,7 @@ def of_row(directory: Path) -> tuple[str, dict[str, float]]:
     with np.load(directory / CLAIMS_FILE) as body:
         found = scores(*(torch.from_numpy(body[name]) for name in ("claimed", "viable")))
     name = name_of(Cell(cell["method"], options=tuple(cell["options"]), trials=cell.get("trials", 0)))
-    return f"{name} seed {cell['seed']}", found
+    return f"{name}, budget {cell['budget']}, seed {cell['seed']}", found
 
 
 def main() -> None:
@@ -170,7 +170,7 @@ def main() -> None:
             found[label] = scores(value <= 0, kernel.contains(states))
             print(row(f"{name}, {label}", found[label]), flush=True)
         found["training ended"] = agent.description.get("stop_reason", "")
-    for directory in given.rows:
+    for directory in (path for path in given.rows if not path.is_file()):  # trials lie beside rows
         name, found = of_row(directory)
         body["rows"][name] = found
         print(row(f"{name}, its grid", found), flush=True)

@@ -134,7 +134,7 @@ class Point:
         """Trained and scored as a row of the comparison."""
         method = make("sspl", [f"overrides={json.dumps(words)}"])
         assert isinstance(method, SSPL)
-        method.directory, env = directory, Cell("kernel", self.env, seed=self.seed).environment()
+        method.directory, method.env_name, env = directory, self.env, Cell("kernel", self.env, seed=self.seed).environment()
         method.fit(None, env, Budget("few", *(round(share * self.transitions) for share in self.starts)), self.seed)
         return method.checks, method.needs, score(method, env, sizes).to_dict()
 

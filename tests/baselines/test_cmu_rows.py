@@ -21,7 +21,7 @@ def test_a_row_is_scored_on_the_cells_of_its_grid(tmp_path):
     with np.load(tmp_path / "claims.npz") as body:
         claimed, viable = body["claimed"], body["viable"]
     name, found = of_row(tmp_path)
-    assert name == "box_margin actions=5 seed 2"
+    assert name == "box_margin actions=5, budget none, seed 2"
     assert found["recall"] == pytest.approx((claimed & viable).sum() / viable.sum())
     assert found["unsafe_called_safe"] == pytest.approx((claimed & ~viable).sum() / (~viable).sum())
     assert 0 < found["unsafe_called_safe"] < 1  # what cannot turn away is claimed as well

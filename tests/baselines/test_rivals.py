@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import pytest
 import torch
@@ -10,17 +11,19 @@ from tiny import TINY as TINY_RUN
 
 from torchrl_sspl.baselines import BUDGETS, METHODS, Budget, ScoreConfig, make, record, score
 from torchrl_sspl.baselines.base import nearest_admissible
+from torchrl_sspl.baselines.cell import Cell, run_cell
+from torchrl_sspl.baselines.data import pooled
 from torchrl_sspl.baselines.imitation import KernelExpert
 from torchrl_sspl.baselines.latent_cbf import BoundedAutoencoder, ControlAffine
-from torchrl_sspl.baselines.nerf_cbf import NeRFCBF
+from torchrl_sspl.baselines.nerf_cbf import NeRFCBF, Scene
 from torchrl_sspl.baselines.neural_cbf import QuadraticBarrier
-from torchrl_sspl.baselines.perception import Coordinates, Perception, perception_error
+from torchrl_sspl.baselines.perception import Coordinates, Perception, encoder_for, perception_error
 from torchrl_sspl.baselines.registry import kind_of
 from torchrl_sspl.baselines.scoring import adversarial, harmless, nominals, well_inside
 from torchrl_sspl.baselines.sspl import settings
 from torchrl_sspl.baselines.vision_cbf import Geometry
-from torchrl_sspl.configs import compose
-from torchrl_sspl.envs import CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
+from torchrl_sspl.configs import compose, reader
+from torchrl_sspl.envs import CMUDubinsEnv, CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.experiments import Experiment
@@ -150,6 +153,19 @@ def test_a_training_needs_a_directory(systems):
         make("sspl").fit(None, systems["pendulum"][0], BUDGETS["tiny"], 0)
 
 
+def test_larger_pictures_are_taken_as_they_are_or_refused():
+    env, budget = CMUTwoDiscsEnv([16]), Budget("try", 60, 8, 8)
+    data = record(env, budget, 0, size=64)
+    method = make("imitation", ["steps=2"])
+    method.expert = lambda state: torch.zeros(len(state), 1)
+    method.fit(data, env, budget, 0)
+    seen = env.observe(env.sample_states(3))
+    assert torch.equal(method.act(seen, torch.zeros(3, 1))[0], method.network(pooled(seen, 64)))
+    assert not torch.equal(method.act(seen, torch.zeros(3, 1))[0], method.network(pooled(seen, 32)))
+    with pytest.raises(ConfigError, match="latent_cbf: expected pictures of 32 x 32, received 64 x 64"):
+        make("latent_cbf").fit(data, env, budget, 0)
+
+
 def test_the_imitator_is_told_about_what_it_visits(systems):
     env, kernel, _ = systems["pendulum"]
     budget = Budget("try", 40, 8, 8, rollouts=24)
@@ -164,13 +180,29 @@ def test_its_own_training_takes_the_budget_and_no_rollouts(tmp_path, systems):
     steps = ",".join(f"synthesis.{name}_steps=4" for name in ("dynamics", "teach", "fit", "steer", "tune"))
     sizes = f"overrides=[preset=smoke,{steps},synthesis.check_episodes=20,trainer.optim_steps_per_batch=2,env.image_size=32]"
     method = make("sspl", [sizes])
-    method.directory = tmp_path
+    method.directory, method.env_name = tmp_path, "pendulum"
     env = PendulumEnv([4], image_size=32)
     method.fit(None, env, BUDGETS["tiny"], 0)
     assert method.needs.transitions == 1280  # one batch
     assert method.needs.rollouts == 0
     assert (tmp_path / "run" / "agent" / "agent.json").is_file()
     assert method.act(env.observe(torch.zeros(2, 2)), torch.zeros(2, 1))[0].shape == (2, 1)
+
+
+def test_its_own_training_is_of_the_system_that_is_scored(tmp_path, monkeypatch):
+    seen = []
+    own = tmp_path / "strong.yaml"
+    own.write_text((Path(reader.__file__).parent / "env" / "pendulum.yaml").read_text().replace("max_torque: 10.0", "max_torque: 4.0"))
+
+    def stop(config):
+        seen.append(config.env)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("torchrl_sspl.baselines.sspl.Experiment", stop)
+    for env in ("pendulum", str(own)):
+        with pytest.raises(KeyboardInterrupt):
+            run_cell(Cell.of("sspl", [f"env={env}", f"out_dir={tmp_path / 'row'}", "budget=tiny"]))
+    assert [config["max_torque"] for config in seen] == [10.0, 4.0]
 
 
 @pytest.mark.parametrize("task", ["pendulum", "dubins"])
@@ -206,16 +238,24 @@ def test_coordinates_and_geometry_tell_the_state(env):
         Coordinates(DubinsEnv(yaw_lag=(0.05, 0.05)))
 
 
-@pytest.mark.parametrize("env", [PendulumEnv(), DubinsEnv()], ids=["pendulum", "dubins"])
+@pytest.mark.parametrize("env", [PendulumEnv(), DubinsEnv(), CMUDubinsEnv()], ids=["pendulum", "dubins", "cmu"])
 def test_the_geometry_lies_where_the_picture_shows_it(env):
-    from torchrl_sspl.baselines.data import pooled
-
-    state = torch.tensor([[0.6, 0.0]]) if env.state_dim == 2 else torch.tensor([[1.2, -0.5, 0.4]])
-    of, empty = Geometry(env), env.draw(state.clone().fill_(math.pi if env.state_dim == 2 else -1.6))
+    state = torch.tensor([[0.6, 0.0]]) if env.state_dim == 2 else torch.tensor([[0.9, -0.7, 0.4]])
+    of, empty = Geometry(env), env.draw(state.clone().fill_(math.pi if env.state_dim == 2 else -1.0))
     changed = (pooled(env.draw(state)).float() - pooled(empty).float()).abs().sum(1)[0]
     x, y = of.place(state)[0]
     i, j = round(float((y + 1) / 2 * 32 - 0.5)), round(float((x + 1) / 2 * 32 - 0.5))
     assert changed[max(0, i - 1) : i + 2, max(0, j - 1) : j + 2].max() > 60
+    if env.state_dim > 2:
+        assert Scene(env, torch.ones(3)).view == env.half_view
+
+
+def test_the_encoder_of_a_car_of_one_colour_tells_its_heading():
+    env = CMUDubinsEnv([16])
+    data = record(env, Budget("try", 100, 0, 0), 1)
+    encoder = encoder_for(env, 4, data)
+    told = encoder(pooled(env.observe(torch.tensor([[0.8, 0.7, heading] for heading in (0.0, 1.5, 3.0, -1.5)]))))
+    assert torch.pdist(told.detach()).min() > 0.3
 
 
 def test_the_state_is_learnt_from_pictures(systems):

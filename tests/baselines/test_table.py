@@ -168,6 +168,20 @@ def test_a_car_is_shown_at_its_middle_heading(tmp_path):
     assert claims([replace(cell, out_dir="nowhere")]) is None
 
 
+def test_a_page_has_systems_of_more_coordinates_and_systems_of_a_file(tmp_path, monkeypatch):
+    states = torch.cartesian_prod(torch.linspace(-1, 1, 5), torch.linspace(-2, 2, 4), torch.arange(-1.0, 2.0), torch.tensor([-1.0, 0.5])).numpy()
+    np.savez(tmp_path / CLAIMS_FILE, states=states, claimed=states[:, 2] == 0, viable=states[:, 3] > 0)
+    cell = Cell.of("kernel", ["env=own/car.yaml", f"out_dir={tmp_path}"])
+    shown = claims([cell]).axes[0].images[0].get_array()
+    assert shown.shape == (4, 5, 3)
+    assert len({tuple(colour) for row in shown for colour in row.tolist()}) == 1  # claimed, in the kernel
+    films = []
+    monkeypatch.setattr("torchrl_sspl.baselines.page.failures", lambda cells, path: films.append(path))
+    row = run_cell(Cell.of("lqr", [f"out_dir={tmp_path / 'row'}", *SMALL]))
+    page([(cell, row)], tmp_path / "table.html")
+    assert films == [tmp_path / "failures-car.mp4"]
+
+
 def test_several_seeds_are_a_mean_and_the_worst():
     def row(value, proved="nothing"):
         names = ["claimed_over_kernel", "false_safe", "latency_p50", "latency_p99"]

@@ -113,6 +113,7 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
     first = run_cell(Cell.of("nerf_cbf", ["seed=0", *words]))
     assert first["cell"]["trials"] == 3
     assert len(first["tuning"]["trials"]) == 3
+    assert first["tuning"]["needs"] == {"transitions": BUDGETS["tiny"].total, "episodes_at_most": 1200}
     assert 0.0 < first["minutes"]["trials_cpu"] < 10.0
     assert first["tuning"]["chosen"] in [t["options"] for t in first["tuning"]["trials"]]
     path = tmp_path / "runs/baselines/pendulum/tiny/nerf_cbf-steps-2-trials-3" / TRIALS_FILE
@@ -124,13 +125,18 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
     assert Cell.of("lqr", ["trials=8"]).trials == 0
     assert SEED not in (0, 1, 2)
     told["of"]["horizon"] = 7
+    path.write_text(json.dumps(told))
+    with pytest.raises(OutputError, match=r"expected trials in episodes of 4 steps in '.*', found those of 7; give score\.horizon=7"):
+        run_cell(Cell.of("nerf_cbf", ["seed=2", *words]))
+    assert json.loads(path.read_text()) == told
+    told["of"] |= {"horizon": 4, "env": "dubins"}
     path.write_text(json.dumps(told))  # trials of something else
     monkeypatch.setattr("torchrl_sspl.baselines.tuning.search", lambda *of: (("beta=3.0",), []))
     assert run_cell(Cell.of("nerf_cbf", ["seed=2", *words]))["tuning"]["chosen"] == ["beta=3.0"]
     monkeypatch.undo()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(kind_of("nerf_cbf"), "space", {"beta": (7.0, 8.0), "steps": (900,)})
-    told["of"]["horizon"] = 4
+    told["of"]["env"] = "pendulum"
     path.write_text(json.dumps(told))  # of another space: the defaults alone are the same
     trials = run_cell(Cell.of("nerf_cbf", ["seed=4", *words]))["tuning"]["trials"]
     assert sorted(t["options"] for t in trials) == [[], ["beta=7.0"], ["beta=8.0"]]

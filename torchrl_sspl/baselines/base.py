@@ -116,6 +116,7 @@ class SafetyMethod(ABC):
         needs: what it was given, complete after ``fit``.
         notes: figures of its own training.
         directory: where a training of its own may write; None: nowhere.
+        env_name: name or file of the system's configuration, ``env=`` of a cell; "": not known.
         stages: what stages of ``fit`` have learnt, see :meth:`stage`; trials that fit on the same data share it.
         Config: dataclass of its options.
         space: what is tried where it is tuned, values by option.
@@ -148,6 +149,7 @@ class SafetyMethod(ABC):
         self.config: Any = config if config is not None or self.Config is None else self.Config()
         self.notes: dict[str, float] = {}
         self.directory: Path | None = None
+        self.env_name = ""
         self.stages: dict[tuple[str, ...], Any] = {}
 
     def stage(self, options: Sequence[str], learn: Callable[[], T]) -> T:

@@ -198,7 +198,7 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
     def trial(words: Sequence[str]) -> float:
         method = make(cell.method, [*cell.options, *words])
         with tempfile.TemporaryDirectory() as where:
-            method.directory, method.stages = Path(where), stages
+            method.directory, method.env_name, method.stages = Path(where), cell.env, stages
             _fit(method, env, cell, tuning.SEED)
             return tuning.merit(method, env, horizon=horizon)
 
@@ -208,11 +208,17 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
 
 
 def _told(path: Path, asked: dict[str, Any], options: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
-    """The trials that an earlier call has made, as far as they are those of these options: a space may have changed since."""
+    """The trials that an earlier call has made, as far as they are those of these options: a space may have changed since.
+
+    An OutputError if they were made in episodes of another length: rows of one method would carry different options.
+    """
     if not path.is_file():
         return []
     found = _read(path, "trials")
-    pairs = zip(found["trials"], options, strict=False) if found.get("of") == asked else ()
+    of, horizon = found.get("of") or {}, asked["horizon"]
+    if of != asked and {**of, "horizon": horizon} == asked:
+        raise OutputError(f"expected trials in episodes of {horizon} steps in '{path}', found those of {of['horizon']}; give score.horizon={of['horizon']}, or remove the file")
+    pairs = zip(found["trials"], options, strict=False) if of == asked else ()
     return [trial for trial, _ in itertools.takewhile(lambda pair: pair[0]["options"] == list(pair[1]), pairs)]
 
 
@@ -236,7 +242,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         env = cell.environment()
         chosen, trials = _tuned(cell) if cell.trials else ((), [])
         method = make(cell.method, [*cell.options, *chosen])
-        method.directory = directory
+        method.directory, method.env_name = directory, cell.env
         clock = [time.perf_counter()]
         if method.learns and method.records:
             _recorded(cell.env, cell.budget, cell.seed)
@@ -253,7 +259,9 @@ def run_cell(cell: Cell) -> dict[str, Any]:
             "minutes": minutes | {"fit_cpu": used / 60} | _of_trials(trials), "measurements": found.to_dict(), "notes": method.notes,
         }  # fmt: skip
         if cell.trials:
-            row["tuning"] = {"chosen": list(chosen), "trials": trials}
+            # What the choice rests on, beside the needs of the fit.
+            more = {"transitions": BUDGETS[cell.budget].total, "episodes_at_most": len(trials) * tuning.STARTS}
+            row["tuning"] = {"chosen": list(chosen), "trials": trials, "needs": more}
         claims = found.arrays
         if "barrier" in claims:
             packed = io.BytesIO()

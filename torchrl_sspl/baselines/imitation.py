@@ -132,7 +132,7 @@ class Imitation(SafetyMethod):
 
         def policy(rows: TensorDictBase) -> TensorDictBase:
             with torch.no_grad():
-                own, best = self.network(pooled(rows["pixels"])), expert(rows["state"])
+                own, best = self._own(rows["pixels"]), expert(rows["state"])
             mixed = torch.rand(len(own), 1, generator=generator) < share
             return rows.set("action", torch.where(mixed, best, own))
 
@@ -145,7 +145,11 @@ class Imitation(SafetyMethod):
     @torch.no_grad()
     def act(self, seen: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor]:
         """The learner's own action, whatever is wanted."""
-        return self.network(pooled(seen)), torch.zeros(len(seen), dtype=torch.bool)
+        return self._own(seen), torch.zeros(len(seen), dtype=torch.bool)
+
+    def _own(self, pixels: Tensor) -> Tensor:
+        encoder: Any = self.network[0]
+        return self.network(pooled(pixels, encoder.pool_to[0]))
 
 
 __all__ = ["Imitation", "KernelExpert"]

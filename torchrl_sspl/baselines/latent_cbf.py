@@ -20,6 +20,7 @@ from torchrl_sspl.baselines.base import Budget, Needs, OneStepFilter
 from torchrl_sspl.baselines.data import POOL, Recording, pooled
 from torchrl_sspl.baselines.perception import train
 from torchrl_sspl.envs.base import SafetyEnv
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.modules import InverseDynamics
 from torchrl_sspl.modules.networks import mlp
 from torchrl_sspl.sets import SAFE, UNSAFE
@@ -107,6 +108,8 @@ class LatentCBF(OneStepFilter):
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Autoencoder, dynamics, barrier, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
+        if data.frames.shape[-1] != POOL:
+            raise ConfigError(f"{self.name}: expected pictures of {POOL} x {POOL}, received {data.frames.shape[-1]} x {data.frames.shape[-1]}")
         self.env, self.alpha, self.offset = env, c.alpha, c.offset
         networks = ("latent", "gain", "autoencoder_steps", "inverse_dynamics")
         self.encoder, self.notes["reconstruction_loss"], z, after = self.stage(networks, lambda: self._reconstruct(data, seed))

@@ -71,7 +71,7 @@ class Scene(nn.Module):
         super().__init__()
         if not isinstance(env, PixelPendulumEnv | DubinsEnv) or env.state_dim > 3:
             raise ConfigError(f"expected a pendulum or a Dubins car without a yaw lag, received {type(env).__name__}")
-        self.view = 1.2 * env.arena_half_size if isinstance(env, DubinsEnv) else 2.2
+        self.view = env.half_view if isinstance(env, DubinsEnv) else 2.2
         self.car = isinstance(env, DubinsEnv)
         self.still, self.robot = Field(), Field()
         self.register_buffer("ground", ground)
@@ -168,7 +168,8 @@ class NeRFCBF(OneStepFilter):
         occupied = places[stops]
         far = torch.full((len(places),), 2 * reach)
         if len(occupied):
-            far = torch.cat([torch.cdist(part, occupied, p=torch.inf).amin(1) for part in places.split(1000)])
+            p = 2.0 if env.obstacle_shape == "disc" else torch.inf
+            far = torch.cat([torch.cdist(part, occupied, p=p).amin(1) for part in places.split(1000)])
         # U is larger than what stands there, by the reach of the robot.
         self.table = (far - (env.unsafe_half_size - env.obstacle_half_size)).reshape(1, 1, _TABLE, _TABLE)
 

@@ -60,7 +60,7 @@ def page(rows: Sequence[tuple[Cell, Row]], path: str | Path) -> Path:
     found, path = [], Path(path)
     for env, of_env in tables(rows).items():
         cells = [cell for cell, _ in rows if cell.env == env]
-        drawn, film = claims(cells), failures(cells, path.with_name(f"failures-{env}.mp4"))
+        drawn, film = claims(cells), failures(cells, path.with_name(f"failures-{Path(env).stem}.mp4"))
         figures = [] if drawn is None else [figure_picture(f"Claimed sets, {env}", drawn)]
         if film is not None:
             figures.append(film_picture(film, "One failure of every method that has any: from its claimed set into U. Solid: what it claims; dashed: the true kernel."))
@@ -72,14 +72,14 @@ def page(rows: Sequence[tuple[Cell, Row]], path: str | Path) -> Path:
 def claims(cells: Sequence[Cell]) -> Figure | None:
     """What the methods of some cells claim of one system, side by side, of each the first seed that was measured; None without any.
 
-    Of a system of three coordinates the figure shows the third at its middle. Source: none.
+    Of a system of more than two coordinates the figure shows the others at their middle. Source: none.
     """
     first = _first(cells)
     if not first:
         return None
     rows = -(-len(first) // _COLUMNS)
     caption = (
-        "Green: claimed, and in the true kernel; red: claimed outside of it; grey: the rest of the kernel. A third coordinate is at its "
+        "Green: claimed, and in the true kernel; red: claimed outside of it; grey: the rest of the kernel. Coordinates after the second are at their "
         "middle; methods without a claimed set are left out."
     )
     figure = new_figure(2.2 * _COLUMNS, 2.3 * rows, caption)
@@ -139,10 +139,9 @@ def _slice(path: Path) -> tuple[Any, tuple[float, ...]]:
     """Colours ``(y, x, 3)`` of a slice of the grid, and its borders."""
     with np.load(path) as body:
         states, claimed, viable = body["states"], body["claimed"], body["viable"]
-    if states.shape[1] > 2:
-        near = np.abs(states[:, 2]).min()
-        chosen = np.abs(states[:, 2]) == near
-        chosen &= states[:, 2] == states[chosen][0, 2]  # of two that are as near the first
+    for k in range(2, states.shape[1]):
+        nodes = np.unique(states[:, k])
+        chosen = states[:, k] == nodes[np.abs(nodes).argmin()]  # of two that are as near the first
         states, claimed, viable = states[chosen], claimed[chosen], viable[chosen]
     shape = [len(np.unique(states[:, k])) for k in (0, 1)]
     kinds = np.where(claimed, np.where(viable, 2, 3), np.where(viable, 1, 0)).reshape(shape).T

@@ -9,11 +9,12 @@ from torch import Tensor, nn
 
 from torchrl_sspl.baselines.data import POOL, Recording, pooled
 from torchrl_sspl.envs.base import SafetyEnv, wrapped
+from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.modules import FrameEncoder, MomentEncoder, ShapePlaceEncoder
+from torchrl_sspl.modules import FrameEncoder, MomentEncoder, ShapeEncoder, ShapePlaceEncoder
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.trainers.phases import InnerLoop
 
@@ -60,18 +61,20 @@ class Coordinates:
 
 
 def encoder_for(env: SafetyEnv, size: int, data: Recording) -> FrameEncoder:
-    """An encoder for the system, on pictures of the recording's size, untrained: moments for cars, as this library recommends, else convolutions.
+    """An encoder for the system, on pictures of the recording's size, untrained: moments for cars, else convolutions.
 
-    For the pendulum this library recommends ``ContrastEncoder`` on pictures of 64 x 64. Source: none.
+    The heading of a car of one colour is told by its shape. It is what this library recommends, but for the pendulum (``ContrastEncoder`` on
+    pictures of 64 x 64) and CMU's car (``ShapeBearingEncoder``, which does not tell the place). Source: none.
 
     Args:
         env: the system.
         size: of what it gives.
         data: pictures from which an encoder of moments takes its background.
     """
-    if not isinstance(env, DubinsEnv | CMUTwoDiscsEnv):
+    cars = {CMUDubinsEnv: ShapeEncoder, DubinsEnv: MomentEncoder, CMUTwoDiscsEnv: ShapePlaceEncoder}  # a class before the one that it is made from
+    kind = next((encoder for of, encoder in cars.items() if isinstance(env, of)), None)
+    if kind is None:
         return FrameEncoder(size, pool_to=POOL)
-    kind = MomentEncoder if isinstance(env, DubinsEnv) else ShapePlaceEncoder
     encoder = kind(max(size, 4), pool_to=data.frames.shape[-1])
     rows = torch.arange(len(data))[:: max(1, len(data) // 2000)]
     encoder.fit(data.frames[rows, 1])

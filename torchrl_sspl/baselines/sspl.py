@@ -133,13 +133,12 @@ class SSPL(SafetyMethod):
         return json.loads(found.read_text()).get("budget", {}) if found.is_file() else {}
 
     def _train(self, env: SafetyEnv, budget: Budget, seed: int) -> tuple[Agent, dict[str, int]]:
-        if self.directory is None:
-            raise ConfigError("sspl: expected a directory for the training, received none; run it as a cell")
-        system = {PendulumEnv: "pendulum", DubinsEnv: "dubins"}.get(type(env))
-        if system is None:
+        if self.directory is None or not self.env_name:
+            raise ConfigError("sspl: expected a directory and a system for the training, received none; run it as a cell")
+        if type(env) not in (PendulumEnv, DubinsEnv):
             raise ConfigError(f"sspl: expected env=pendulum or env=dubins, received {type(env).__name__}; of other systems give agent=, a run of 'sspl train'")
         plan = ["logger=none", "trainer.progress=false", "evaluation.calibrate=true", f"seed={seed}", f"out_dir={self.directory / 'run'}"]
-        plan = [*settings(system, budget), *plan]
+        plan = [*settings(self.env_name, budget), *plan]
         experiment = Experiment(compose([*plan, *self.config.overrides]))
         agent = experiment.train().cpu()
         self.checks = experiment.work.checks

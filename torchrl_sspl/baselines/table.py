@@ -182,6 +182,8 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
                 shifted.append([label, budget, *(_on_shift(good, shift) for shift in _SHIFTS)])
             facts = ["not counted" if (n := first["needs"].get(key)) is None else str(n) for _, key in _NEEDED]
+            if more := first.get("tuning", {}).get("needs"):
+                facts[0] += f", and {more['transitions']} of trials"
             minutes = f"{sum(row['minutes']['fit_cpu'] for row in good) / len(good):.1f}"
             if "trials_cpu" in first["minutes"]:
                 minutes += f", and {first['minutes']['trials_cpu']:.1f} of trials"

@@ -18,6 +18,7 @@ from torchrl_sspl.errors import SSPLError
 
 SEED = 100  # of recording, weights and starts of the trials; scored seeds are others
 Trial = dict[str, Any]  # the options, what they were worth (None: the fit failed, and why), and s of the processor
+STARTS = 400  # states from which a trial is judged
 LOST = 10.0  # an episode from the claimed set that enters U costs as much as so many that do not are worth
 
 
@@ -44,7 +45,7 @@ def draws(method: str, trials: int, seed: int = SEED, *, named: Sequence[str] = 
 
 
 @torch.no_grad()
-def merit(method: SafetyMethod, env: SafetyEnv, *, states: int = 400, horizon: int = 60, seed: int = SEED) -> float:
+def merit(method: SafetyMethod, env: SafetyEnv, *, states: int = STARTS, horizon: int = 60, seed: int = SEED) -> float:
     r"""What a fitted method is worth: claimed states that it keeps out of U, less ten times those that it does not.
 
     .. math:: M = \frac1n \bigl( \#\{\text{claimed, kept}\} - 10\, \#\{\text{claimed, lost}\} \bigr)
@@ -107,4 +108,4 @@ def search(
     return options[best], found
 
 
-__all__ = ["LOST", "SEED", "draws", "merit", "search"]
+__all__ = ["LOST", "SEED", "STARTS", "draws", "merit", "search"]

@@ -57,7 +57,7 @@ class Geometry:
         """Places ``(n, 2)`` of tip or robot in the picture, to the right and down."""
         if self.pendulum:
             return _ROD * torch.stack([-state[:, 0].sin(), -state[:, 0].cos()], -1)
-        return state[:, :2] * torch.tensor([1.0, -1.0]) / (1.2 * self.env.arena_half_size)
+        return state[:, :2] * torch.tensor([1.0, -1.0]) / self.env.half_view
 
     def draw(self, state: Tensor, before: Tensor) -> Tensor:
         """The picture of the geometry, ``(n, channels, 32, 32)``."""
@@ -71,7 +71,7 @@ class Geometry:
         old, new = blob(self.place(before)), blob(self.place(state))
         if self.pendulum:
             return torch.stack([old, new], 1)
-        view = 1.2 * self.env.arena_half_size
+        view = self.env.half_view
         x, y = torch.meshgrid(view * self.axis, -view * self.axis, indexing="xy")
         where = torch.stack([x, y, torch.zeros_like(x)], -1)
         mask = self.env.unsafe_set.contains(where.reshape(-1, 3)).reshape(1, POOL, POOL).float().expand(len(state), -1, -1)
@@ -91,7 +91,7 @@ class Geometry:
             before, now = torch.atan2(-old[:, 0], -old[:, 1]), torch.atan2(-new[:, 0], -new[:, 1])
             moved = wrapped(now - before)
             return torch.stack([now, moved / self.env.dt], -1)
-        place = self.centre(picture[:, 2]) * torch.tensor([1.0, -1.0]) * 1.2 * self.env.arena_half_size
+        place = self.centre(picture[:, 2]) * torch.tensor([1.0, -1.0]) * self.env.half_view
         cos, sin = (picture[:, k] * picture[:, 2].clamp_min(0) for k in (3, 4))
         return torch.cat([place, torch.atan2(sin.sum((-2, -1)), cos.sum((-2, -1)))[:, None]], -1)
 

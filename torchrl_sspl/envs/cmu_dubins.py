@@ -107,7 +107,7 @@ class CMUDubinsEnv(DubinsEnv):
             safe_half_size=ARENA - SPEED * STEP, unsafe_half_size=FAILURE, obstacle_half_size=FAILURE,
             obstacle_shape="disc", horizon=horizon, initial_set=initial_set, device=device, seed=seed,
         )  # fmt: skip
-        self.safe_set = Difference(self.safe_set, Stays(ARENA, SPEED * STEP))
+        self.safe_set, self.half_view = Difference(self.safe_set, Stays(ARENA, SPEED * STEP)), ARENA
         self.arrow_scale, self.arrow_width, self.dot_area = float(arrow_scale), float(arrow_width), float(dot_area)
         self.background, self.obstacle_colour = _colour("background", background), _colour("obstacle_colour", obstacle_colour)
         self.car_colour = _colour("car_colour", car_colour)

@@ -220,10 +220,8 @@ class DubinsEnv(SafetyEnv):
         self.obstacle_centre, self.arena_half_size = (centre[0], centre[1]), float(arena_half_size)
         self.safe_half_size, self.unsafe_half_size = float(safe_half_size), float(unsafe_half_size)
         self.obstacle = obstacle  # what stands on the ground, a set of (x, y)
-        # Robots a little outside the arena are still seen.
-        self._compositor = TopViewCompositor(
-            image_size, obstacle=obstacle, half_view=1.2 * arena_half_size, device=self.device
-        )
+        self.half_view = 1.2 * self.arena_half_size  # robots a little outside the arena are still seen
+        self._compositor = TopViewCompositor(image_size, obstacle=obstacle, half_view=self.half_view, device=self.device)
 
     @property
     def system(self) -> System:
