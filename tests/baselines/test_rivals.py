@@ -253,9 +253,11 @@ def test_the_geometry_lies_where_the_picture_shows_it(env):
 def test_the_encoder_of_a_car_of_one_colour_tells_its_heading():
     env = CMUDubinsEnv([16])
     data = record(env, Budget("try", 100, 0, 0), 1)
-    encoder = encoder_for(env, 4, data)
-    told = encoder(pooled(env.observe(torch.tensor([[0.8, 0.7, heading] for heading in (0.0, 1.5, 3.0, -1.5)]))))
-    assert torch.pdist(told.detach()).min() > 0.3
+    seen = pooled(env.observe(torch.tensor([[0.8, 0.7, heading] for heading in (0.0, 1.5, 3.0, -1.5)])))
+    for whole, size in ((False, 2), (True, 6)):
+        told = encoder_for(env, 6, data, whole=whole)(seen).detach()
+        assert told.shape == (4, size)
+        assert torch.pdist(told).min() > 0.3
 
 
 def test_the_state_is_learnt_from_pictures(systems):

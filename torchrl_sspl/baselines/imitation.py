@@ -101,7 +101,7 @@ class Imitation(SafetyMethod):
         """Learn from the expert's actions; see :meth:`SafetyMethod.fit`."""
         self.env, self.scale = env, env.max_action
         expert = self.expert or KernelExpert(env)
-        encoder = encoder_for(env, 8 if env.state_dim == 2 else 6, data)
+        encoder = encoder_for(env, 8 if env.state_dim == 2 else 6, data, whole=True)
         head = Policy(encoder.latent_dim, env.action_dim, (48, 48), env.max_action)
         self.network = nn.Sequential(encoder, head)
         rounds = self.config.rounds if budget.rollouts else 0

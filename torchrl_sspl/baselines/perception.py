@@ -14,7 +14,7 @@ from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
 from torchrl_sspl.envs.two_discs import CMUTwoDiscsEnv
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.modules import FrameEncoder, MomentEncoder, ShapeEncoder, ShapePlaceEncoder
+from torchrl_sspl.modules import FrameEncoder, MomentEncoder, ShapeBearingEncoder, ShapeEncoder, ShapePlaceEncoder
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.trainers.phases import InnerLoop
 
@@ -60,24 +60,30 @@ class Coordinates:
         return torch.stack([f[:, 0] * self.high[0], f[:, 1] * self.high[1], torch.atan2(f[:, 3], f[:, 2])], -1)
 
 
-def encoder_for(env: SafetyEnv, size: int, data: Recording) -> FrameEncoder:
+def encoder_for(env: SafetyEnv, size: int, data: Recording, *, whole: bool = False) -> FrameEncoder:
     """An encoder for the system, on pictures of the recording's size, untrained: moments for cars, else convolutions.
 
-    The heading of a car of one colour is told by its shape. It is what this library recommends, but for the pendulum (``ContrastEncoder`` on
-    pictures of 64 x 64) and CMU's car (``ShapeBearingEncoder``, which does not tell the place). Source: none.
+    It is what this library recommends for the system, but for the pendulum, where that is ``ContrastEncoder`` on pictures of 64 x 64. Of CMU's
+    car it tells where the disc lies, seen from the car, and not the whole state. Source: none.
 
     Args:
         env: the system.
         size: of what it gives.
         data: pictures from which an encoder of moments takes its background.
+        whole: whether the state has to be told, place and heading.
     """
-    cars = {CMUDubinsEnv: ShapeEncoder, DubinsEnv: MomentEncoder, CMUTwoDiscsEnv: ShapePlaceEncoder}  # a class before the one that it is made from
-    kind = next((encoder for of, encoder in cars.items() if isinstance(env, of)), None)
-    if kind is None:
+    side = data.frames.shape[-1]
+    encoder: FrameEncoder
+    if isinstance(env, CMUDubinsEnv):  # a car of one colour
+        encoder = ShapeEncoder(max(size, 4), pool_to=side) if whole else ShapeBearingEncoder(ShapeBearingEncoder.seen_dim, pool_to=side)
+    elif isinstance(env, DubinsEnv):
+        encoder = MomentEncoder(max(size, 4), pool_to=side)
+    elif isinstance(env, CMUTwoDiscsEnv):
+        encoder = ShapePlaceEncoder(max(size, 4), pool_to=side)
+    else:
         return FrameEncoder(size, pool_to=POOL)
-    encoder = kind(max(size, 4), pool_to=data.frames.shape[-1])
     rows = torch.arange(len(data))[:: max(1, len(data) // 2000)]
-    encoder.fit(data.frames[rows, 1])
+    encoder.fit(data.frames[rows, 1])  # type: ignore[operator]
     return encoder
 
 
@@ -124,7 +130,7 @@ class Perception(nn.Module):
     def __init__(self, env: SafetyEnv, data: Recording, steps: int, seed: int) -> None:
         super().__init__()
         self.at, self.wrap = Coordinates(env), env.wrap
-        self.encoder = encoder_for(env, self.at.size, data)
+        self.encoder = encoder_for(env, self.at.size, data, whole=True)
         target = self.at.features(data.state)
 
         def loss(rows: Tensor) -> dict[str, Tensor]:
