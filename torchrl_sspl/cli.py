@@ -221,17 +221,17 @@ def _verify(words: list[str]) -> int:
     """Check the certificates of an agent again.
 
     0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no certificate or the file is
-    none, 4 if the agent cannot be read, 5 if the time was too short.
+    none, 4 if the agent cannot be read, 5 if the time was too short, 6 if --measure could measure nothing.
     """
     parser = argparse.ArgumentParser(prog="sspl verify", description="Check the certificates of an agent again.")
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
-    text = "measure all episodes again, on the system that the agent names; this runs code that the agent names"
-    parser.add_argument("--measure", action="store_true", help=text)
+    parser.add_argument("--measure", action="store_true", help="measure all episodes again, on the system that the agent names; implies --trust")
+    parser.add_argument("--trust", action="store_true", help="run code of its own that the agent names: networks, a system")
     parser.add_argument("--seconds", type=float, default=900.0, help="time limit, without --measure (default: 900)")
     options = parser.parse_args(words)
     from torchrl_sspl.evaluation.certify import verify_run
 
-    return int(verify_run(options.agent, measure=options.measure or None, seconds=options.seconds))
+    return int(verify_run(options.agent, measure=options.measure or None, trust=options.trust, seconds=options.seconds))
 
 
 def _compare(words: list[str]) -> int:

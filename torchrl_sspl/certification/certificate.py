@@ -56,7 +56,7 @@ class Reason(StrEnum):
     UNDECIDED = "the budget was too small to decide"
     MARGIN_TOO_SMALL = "the error that the set tolerates is smaller than required"
     ROUNDING = "rounding in the deployed networks may exceed what the proof leaves room for"
-    LEVEL = "the level is positive: {B <= s} is more than {B <= 0}"
+    LEVEL = "the level is positive, or not the one that the agent keeps as it runs"
     OUTSIDE_DOMAIN = "an observation is encoded outside the domain"
     UNSAFE_INSIDE = "an unsafe observation lies in the set"
     EPISODES_LEAVE = "too many episodes leave the set"

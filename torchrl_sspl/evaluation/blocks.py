@@ -285,6 +285,7 @@ class ResetBlocks:
             env.close()
         both = own.joined(at_random)
         barrier, own_barrier = both.barrier, own.barrier
+        looks = torch.minimum(barrier, both.seen)  # a picture alone may look safe where the memory knows better
         start = own.select(~(own_barrier[0] > level))  # a start that is no number counts, as an event
         shown, margin = (both.region == UNSAFE) & both.alive, _BARELY * _range(barrier[both.alive], level)
         seen = both.latent[both.alive]
@@ -292,7 +293,7 @@ class ResetBlocks:
             replace(
                 NOTHING, episodes=len(start), steps=int(start.alive[1:].sum()),
                 **counted(start, level, self.tolerated, s, self.held)[0],
-                shown=int(shown.any(0).sum()), mistaken=int((shown & ~(barrier > level - m)).any(0).sum()),
+                shown=int(shown.any(0).sum()), mistaken=int((shown & ~(looks > level - m)).any(0).sum()),
                 seen=len(seen), outside=int((~(seen.abs() <= 1.0).all(1)).sum()),
             )
             for s, m in ((0.0, 0.0), (_BARELY, margin))
@@ -303,7 +304,7 @@ class ResetBlocks:
         safe = barrier[(both.region == SAFE) & both.alive]
         return Block(
             counts, least, int(near), worst, start.alive.sum(0) - 1, _trajectories(start), [], _rims(start, level),
-            mine[inside], safe, barrier[shown], mine, at_random.latent[at_random.alive],
+            mine[inside], safe, looks[shown], mine, at_random.latent[at_random.alive],
         )  # fmt: skip
 
 

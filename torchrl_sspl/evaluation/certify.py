@@ -41,7 +41,7 @@ from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.rounding import missed, shown
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
-from torchrl_sspl.errors import CertificationError, CheckpointError, SSPLError
+from torchrl_sspl.errors import CertificationError, CheckpointError, ConfigError, SSPLError
 from torchrl_sspl.evaluation.blocks import (
     Block,
     MakeEnv,
@@ -82,6 +82,7 @@ class Exit(IntEnum):
     MALFORMED = 3  # there is no certificate, or the file is none
     AGENT = 4  # the agent cannot be read
     TIME = 5  # nothing was found wrong, but not everything was found again in the time
+    UNMEASURED = 6  # all episodes were to be measured again, and none could be
 
 
 def certify(
@@ -105,7 +106,7 @@ def certify(
         agent: frozen agent.
         env: the true system, for the layers that are measured; without one, only what the weights prove.
         name: name of the agent.
-        level: s, barrier units; searched for if not given.
+        level: s, barrier units; searched for if not given; 0 of an agent that tolerates errors, which keeps {B <= 0} as it runs.
         episodes: number of fresh episodes from the set, and of fresh observations of U.
         horizon: steps per episode.
         seed: root of the seeds of the fresh data, which are drawn in a purpose of their own; default: that of the
@@ -241,6 +242,10 @@ def _used(agent: Agent, more: Sequence[int]) -> list[int] | None:
 def _proved(agent: Agent, name: str, level: float | None, budget: Budget | None) -> Certificate:
     """A certificate with what the weights prove."""
     budget = budget or Budget(seconds=300.0)
+    if agent.tolerated_error:
+        if level:
+            raise ConfigError(f"level: expected 0 of an agent that tolerates errors, since its controller and its filter keep {{B <= 0}}, received {level:g}")
+        level = 0.0
     if level is None:
         level = level_that_holds(**_loop(agent), budget=budget)
     label = re.sub(r"[^\w .,()+-]", "_", name)[:80] or "agent"
@@ -376,6 +381,7 @@ def verify_run(
     *,
     env: SafetyEnv | MakeEnv | None = None,
     measure: bool | None = None,
+    trust: bool = False,
     seconds: float = 900.0,
     report: Callable[[str], None] = print,
 ) -> int:
@@ -388,15 +394,16 @@ def verify_run(
     Args:
         name: name of a shipped agent, a run directory or the directory of an agent.
         env: the true system, or a maker of environments, where the agent does not say how to build it.
-        measure: True: measure all blocks again, whatever time it takes, and import the system that the agent names,
-            wherever it comes from (it runs code of its own); False: none; default: as above, with systems of this
-            library only.
+        measure: True: measure all blocks again, whatever time it takes, and ``trust``; False: none; default: as above.
+        trust: import networks and a system that are not of this library, where the agent names such. That runs code, which could
+            print anything: trust whom the agent comes from.
         seconds: time for everything (without ``measure=True``); proofs that are found sooner end sooner.
         report: called with every line that a person should read, the reasons of a failure among them.
 
     Returns:
         An exit code: 0 if everything was found again, 1 if something is claimed that is not so, 3 if there is no
-        certificate or the file is none, 4 if the agent cannot be read, 5 if the time was too short.
+        certificate or the file is none, 4 if the agent cannot be read, 5 if the time was too short, 6 if all episodes were to be
+        measured again and none could be.
 
     Raises:
         CheckpointError: if there is no such agent.
@@ -408,7 +415,7 @@ def verify_run(
     directory = agent_directory(name)
     try:
         with _limit(math.inf if measure else seconds):
-            _verify(directory, env, measure, seconds, report)
+            _verify(directory, env, measure, trust or bool(measure), seconds, report)
         return int(Exit.HOLDS)
     except _TimeUp:
         report(f"FAILED {Reason.UNDECIDED.name}: not checked within {seconds:g} s; give it more (seconds)")
@@ -446,6 +453,7 @@ def _verify(
     directory: Path,
     env: SafetyEnv | MakeEnv | None,
     measure: bool | None,
+    trust: bool,
     seconds: float,
     report: Callable[[str], None],
 ) -> None:
@@ -454,11 +462,13 @@ def _verify(
     except CertificationError as error:
         raise _Stop(Exit.MALFORMED, f"FAILED {Reason.SCHEMA_UNKNOWN.name}: {error}") from error
     try:
-        agent = Agent.load(directory)
+        agent = Agent.load(directory, trust=trust)
         _witness(agent)
     except CheckpointError as error:
         raise _Stop(Exit.AGENT, f"FAILED the agent cannot be read: {error}") from error
     began = time.monotonic()
+    if agent.tolerated_error and claimed.level:
+        _refuse({Reason.LEVEL: f"expected 0, at which its controller and its filter keep the set, found {claimed.level:g}"})
     again = Certificate(claimed.agent, weights_digest(agent.state_dict()), _configuration(agent), claimed.level, {})
     again.layers["deterministic"] = claimed.layers["deterministic"]  # first what takes no time
     if claimed.record is not None:
@@ -483,8 +493,10 @@ def _verify(
         found = compared(_proof(agent, claimed.level, budget))
     _refuse(found)
     left = math.inf if measure else min(_SAMPLE, seconds / 3, seconds - (time.monotonic() - began))
-    measured = _measured_again(claimed, agent, env, measure, left)
-    _print(claimed, measured, report)
+    unmeasured, blocks = _measured_again(claimed, agent, env, measure, trust, left)
+    _print(claimed, unmeasured, report)
+    if measure and not blocks:
+        raise _Stop(Exit.UNMEASURED, f"FAILED {Reason.NOT_MEASURED.name}: {unmeasured}")
 
 
 def _refuse(found: Mapping[Reason, str]) -> None:
@@ -514,24 +526,25 @@ def _is_proved(agent: Agent, level: float, name: str, delta: float, budget: Budg
 
 
 def _measured_again(
-    claimed: Certificate, agent: Agent, env: SafetyEnv | MakeEnv | None, measure: bool | None, seconds: float
-) -> str:
-    """Blocks of the same episodes; says what was checked, "" if everything."""
+    claimed: Certificate, agent: Agent, env: SafetyEnv | MakeEnv | None, measure: bool | None, trust: bool, seconds: float
+) -> tuple[str, int]:
+    """Blocks of the same episodes; says what was checked, "" if everything, and how many were measured again."""
     record = claimed.record
     if record is None:
-        return "nothing was measured"
+        return "nothing was measured", 0
     if measure is False:
-        return "not asked for"
+        return "not asked for", 0
     if env is None:
+        factory = described_system(agent.description, trust=trust)
         if record.system == "given":
-            return "its system was given in code; give it to verify_run(env=...)"
-        factory = described_system(agent.description, trust=bool(measure))
+            other = "" if factory is None else ", not the one that the agent names"
+            return f"its system was given in code{other}; give it to verify_run(env=...)", 0
         if factory is None:
-            return "its system is built by code of its own; --measure runs it"
+            return "its system is built by code of its own; --trust runs it", 0
         try:
             env = factory([1], 0)
         except _BROKEN as error:
-            return f"its system cannot be built here: {type(error).__name__}: {str(error)[:200]}"
+            return f"its system cannot be built here: {type(error).__name__}: {str(error)[:200]}", 0
         env = env if record.kind == "states" else factory
     kind: Any = StateBlocks if record.kind == "states" else ResetBlocks
     if (record.kind == "states") != isinstance(env, SafetyEnv):
@@ -547,17 +560,17 @@ def _measured_again(
             if changes:
                 _refuse({Reason.RECORD_CHANGED: f"block {index}: {changes}"})
             if (time.monotonic() - began) * (1 + 1 / len(blocks)) > seconds and len(blocks) < len(order):
-                return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random"
+                return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random", len(blocks)
     except _TimeUp:
         if not blocks:
             raise
-        return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random"
+        return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random", len(blocks)
     fresh = replace(record, blocks=list(record.blocks), sizes={}, numbers={}, rims=[])
     summarise(fresh, [blocks[k] for k in sorted(blocks)], agent)
     changes = summary_changes(record, fresh, sum(b.close for b in blocks.values()))
     if changes:
         _refuse({Reason.RECORD_CHANGED: changes})
-    return ""
+    return "", len(blocks)
 
 
 def _print(claimed: Certificate, unmeasured: str, report: Callable[[str], None]) -> None:
@@ -570,6 +583,9 @@ def _print(claimed: Certificate, unmeasured: str, report: Callable[[str], None])
         report(f"{layer.name:14s} {checked}: {layer.verdict}")
         for s in layer.statements:
             report(_line(s, proof or not unmeasured))
+    if claimed.record is not None:
+        limits = 100 * claimed.record.acceptable, 100 * claimed.record.confidence
+        report(f"A bound on a risk holds here if it is at most {limits[0]:g} %, all of them together with {limits[1]:g} % confidence")
     report(f"OK: the weights are {claimed.weights[:12]}..., and the certificate says what they prove")
     if unmeasured and claimed.record is not None:
         report("What is printed as claimed was not checked again; that its words and bounds follow from its counts was")

@@ -255,11 +255,14 @@ class Agent(nn.Module):
         return path
 
     @classmethod
-    def load(cls, path: str | Path, device: torch.device | str = "cpu") -> Agent:
+    def load(cls, path: str | Path, device: torch.device | str = "cpu", *, trust: bool = True) -> Agent:
         """Read an agent from a directory that :meth:`save` has written, to a device.
 
+        ``trust``: import networks of your own, which the agent names, too; that runs code: trust whom the agent comes from.
+
         Raises:
-            CheckpointError: if a file is missing, unreadable, of another format, or does not fit the networks.
+            CheckpointError: if a file is missing, unreadable, of another format, does not fit the networks, or names a network that is
+                not to be trusted, or none.
             ConfigError: if this machine has no such device.
         """
         path, device = Path(path), usable_device(device)
@@ -277,11 +280,12 @@ class Agent(nn.Module):
                     "the library, train it again or load it with that version"
                 )
             bound, nets = float(body.pop("lipschitz_bound")), body["networks"]
-            encoder, dynamics = _build(ENCODERS, nets["encoder"]), _build(DYNAMICS, nets["dynamics"])
-            agent = cls(
-                encoder, dynamics, mlp_barrier(**nets["barrier"]), _build(POLICIES, nets["policy"]), bound, body
-            )
+            kinds = (ENCODERS, "encoder"), (DYNAMICS, "dynamics"), (POLICIES, "policy")
+            encoder, dynamics, policy = (_build(registry, nets[name], trust) for registry, name in kinds)
+            agent = cls(encoder, dynamics, mlp_barrier(**nets["barrier"]), policy, bound, body)
             weights = load_file(path / WEIGHTS_FILE)
+            if any(w.dtype == torch.float64 for w in weights.values()):
+                agent.double()  # weights are never rounded
             agent.load_state_dict({"gain": agent.gain} | weights)  # without one, it has no observer
             gain_matrix(agent.gain, agent.latent_dim)
         except CheckpointError:
@@ -389,17 +393,26 @@ def _describe(network: nn.Module, latent_dim: int) -> dict[str, Any]:
     return {"class": f"{module}:{kind.__qualname__}" if own else kind.__name__, "arguments": arguments}
 
 
-def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any]) -> nn.Module:
+def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bool) -> nn.Module:
     name = spec["class"]
     if name not in registry and ":" not in name:
         raise CheckpointError(
             f"expected one of the networks {sorted(registry)}, received '{name}'; name a network of your own as "
             "package.module:Class, or add it to the registries of torchrl_sspl.modules.agent before loading"
         )
-    nested = {k: _build(registry, v) for k, v in spec["arguments"].items() if isinstance(v, dict) and "class" in v}
+    if name not in registry and not trust:
+        raise CheckpointError(
+            f"expected networks of this library, received '{name}', whose import runs code; if you trust whom the agent comes from, say so (trust)"
+        )
+    nested = {k: _build(registry, v, trust) for k, v in spec["arguments"].items() if isinstance(v, dict) and "class" in v}
     arguments = spec["arguments"] | nested
     try:
-        return registry[name](**arguments) if name in registry else call_with(resolve(name), arguments)
+        if name in registry:
+            return registry[name](**arguments)
+        kind = resolve(name)
+        if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
+            raise CheckpointError(f"expected a class of networks (nn.Module), received '{name}', which is none")
+        return call_with(kind, arguments)
     except ConfigError as error:
         raise CheckpointError(f"the network '{name}' cannot be built: {error}") from error
 
