@@ -12,7 +12,7 @@ kind are labelled, those that come first (with ``labels.share=0.1`` each with th
 own (``synthesis.check_episodes``), which are not counted. Prints a table in Markdown and writes ``points.json``; ``figure`` draws all points that there are,
 over the number of labels and over that of the transitions, in ``few_labels.png``, and writes them into ``few_labels.csv``: with ``out=docs/images`` it draws the documentation's.
 
-``env=quadruped`` is a run as of ``sspl train``, of ``transitions`` a fifth near the rim of its set and a fifth of its own policy, with a second attempt where the
+``env=quadruped`` is a run as of ``sspl train``, of ``transitions`` a fifth that start anywhere in U, by known resets and without a label, and a fifth of its own policy, with a second attempt where the
 first does not pass. It is scored on the paper's car, from its claimed set alone; of ``score.*`` it takes ``episodes``, ``horizon``, ``grid`` and ``kernel_grid``.
 """
 

@@ -381,6 +381,30 @@ def test_growth_is_never_paid_for_with_invariance():
     assert kept == [0, 0, 0, 3]
 
 
+@pytest.mark.parametrize(("good", "level", "passed"), [(1, 0.04, True), (3, 0.02, True), (99, 0.0, True), (None, 0.02, False)])
+def test_a_policy_that_chooses_is_checked_at_the_level_at_which_it_runs(good, level, passed, monkeypatch):
+    monkeypatch.setattr("torchrl_sspl.trainers.selection.ChoosingPolicy", nn.Module)  # any policy counts as one
+    work, simulated, lowest = Workspace(nn.Identity(), *_networks()), [], 0.0 if good else 0.011
+    place = work.agent(0.0).barrier(torch.zeros(1, 2)).item()
+
+    def held_out(self, work, agent):
+        simulated.append(round(place - agent.barrier(torch.zeros(1, 2)).item(), 4))
+        return len(simulated) - 1  # which simulation it is; the first is that of level 0
+
+    def check(self, work, held_out, level):
+        ok = lowest <= level + 1e-6 and level < 0.041 if held_out == 0 else held_out == good
+        return Check(self.number, level, 0, 0, 0, 0, 1.0, 0.5, ok, "" if ok else "no")
+
+    monkeypatch.setattr(CheckRound, "_held_out", held_out)
+    monkeypatch.setattr(CheckRound, "_check", check)
+    CheckRound(0).run(work)
+    found = work.checks[-1]
+    assert found.passed == passed
+    assert found.level == pytest.approx(level, abs=1e-6)
+    assert (work.best is not None) == passed
+    assert simulated == [0.0, 0.04, 0.03, 0.02, 0.01][: {1: 2, 3: 4, 99: 5, None: 4}[good]]
+
+
 def test_retries_follow_the_rounds_and_learn_from_the_same_data():
     config = SynthesisConfig(rounds=2, retries=2, fit_steps=100)
     phases = synthesis_phases(config, check=CheckRound)

@@ -198,7 +198,7 @@ class SynthesisConfig:
         "adds: those near the set, of near_draws times as many at most.")
     near_draws: int = _option(10, "see rollout_transitions; 1 bounds what a training takes by what is asked for.")
     rim_transitions: int = _option(8_000, "transitions that start in U that every further round adds: of rim_draws "
-        "times as many those whose pictures the barrier puts lowest.")
+        "times as many those whose pictures the barrier puts lowest. With a grid the first round adds as many, anywhere in U.")
     rim_draws: int = _option(5, "see rim_transitions.")
     exploration: float = _option(0.15, "standard deviation of the exploration in further rounds, as a share of the "
         "largest action.")

@@ -327,7 +327,7 @@ class Experiment:
         try:
             self.trainer.train()
         except EmptyRegionError as error:
-            if self.phases.begun:
+            if self.phases.begun or self.trainer._optim_count:
                 raise
             few = "" if self.labels is None else "give labels of both (labels.safe, labels.unsafe, labels.share), "
             raise EmptyRegionError(
@@ -364,9 +364,9 @@ class Experiment:
         """Why the training ended."""
         checks = self.work.checks
         if self.work.best is not None:
-            return f"round {self.work.best['round']} has the largest set that passed the held-out checks"
+            return f"round {self.work.best['round'] + 1} has the largest set that passed the held-out checks"
         if checks:
-            return "no round passed the held-out checks: " + "; ".join(f"round {c.round}: {c.reason}" for c in checks)
+            return "no round passed the held-out checks: " + "; ".join(f"round {c.round + 1}: {c.reason}" for c in checks)
         if self.config.loss.preset == "paper":
             return "all transitions are collected; the printed stop rule, a total loss of zero, was not met"
         return "all phases are done"

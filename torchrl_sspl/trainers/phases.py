@@ -167,6 +167,7 @@ class Check:
     reason: str  # why not
     tolerated: float = 0.0  # error that the set is proved to tolerate, latent units; 0 where that was not asked for
     covered: float = 0.0  # share of the episodes to which the proof applies from the first to the last step
+    started: int = 0  # episodes that started in the set, of which ``left`` is counted; 0: not recorded
 
 
 class Workspace:

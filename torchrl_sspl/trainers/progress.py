@@ -148,14 +148,14 @@ def round_line(check: Any, episodes: int) -> str:
 
     Example:
         >>> from types import SimpleNamespace
-        >>> found = dict(round=0, size=0.62, left=1, touched=0, returned=0.98, passed=True, reason="", covered=0.0)
+        >>> found = dict(round=0, size=0.62, left=1, touched=0, returned=0.98, passed=True, reason="", covered=0.0, started=3912)
         >>> round_line(SimpleNamespace(**found), 4000)
-        'round 1: the safe set covers 62 % of the space outside U; of up to 4,000 held-out episodes 1 left it, 0 entered U; 98 % of the starts in U came back: kept'
+        'round 1: the safe set covers 62 % of the space outside U; of 3,912 held-out episodes 1 left it, 0 entered U; 98 % of the starts in U came back: kept'
     """
     head = f"round {check.round + 1}: "
     if not check.size:
         return f"{head}no safe set that passes was found ({check.reason or 'it is empty'})"
-    counts = f"of up to {episodes:,} held-out episodes {check.left:,} left it, {check.touched:,} entered U"
+    counts = f"of {f'{check.started:,}' if check.started else f'up to {episodes:,}'} held-out episodes {check.left:,} left it, {check.touched:,} entered U"
     proof = f"; the proof covers {100 * check.covered:.3g} % of them" if check.covered else ""
     verdict = "kept" if check.passed else f"not kept, because of: {check.reason}"
     back = f"{100 * check.returned:.3g} % of the starts in U came back"

@@ -15,6 +15,7 @@ from torchrl_sspl.evaluation.controllers import AgentController, RandomControlle
 from torchrl_sspl.evaluation.episodes import separating_level
 from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.modules import ChoosingPolicy
 from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import UNSAFE
@@ -62,7 +63,7 @@ class CheckRound(Phase):
     its pictures, as many more, changed as these are. A set is left from its rim, in the first steps, so many short episodes
     say more than few long ones. Where a proof is asked for, a level passes if the weights say that its set tolerates an
     error (branch and bound), the checks are made with the memory held in the set, and the proof applies to enough of the
-    episodes. An observer that believes itself more than what it sees keeps a constant innovation; a set is refused where
+    episodes. A policy that chooses is simulated at the level at which it will run. An observer that believes itself more than what it sees keeps a constant innovation; a set is refused where
     the mean innovation of an episode is larger than single ones under random actions ever are.
     Source: none; the paper stops at a total loss of zero.
     """
@@ -84,7 +85,8 @@ class CheckRound(Phase):
                 lowest = -_MOST_OF_MARGIN * work.config.margin  # below it the condition says nothing of the level
             tried = [level for level in levels if level >= lowest - 1e-6]
             checks = (self._check(work, held_out, level) for level in tried)
-            found = next((c for c in checks if c.passed), None) or self._missed(work, held_out, tried[-1])
+            passed = (c for c in checks if c.passed)
+            found = (self._as_it_runs(work, [*passed]) if isinstance(agent.policy, ChoosingPolicy) else next(passed, None)) or self._missed(work, held_out, tried[-1])
             if work.config.cover_share > 0:
                 found = self._proved(work, held_out, levels) or found
         work.checks.append(found)
@@ -94,6 +96,23 @@ class CheckRound(Phase):
         rank = [float(sound), float(found.returned >= work.config.return_share), found.size]
         if found.passed and (work.best is None or rank >= list(work.best["rank"])):
             work.keep(rank, self.number, found.level)
+
+    def _as_it_runs(self, work: Workspace, passed: list[Check]) -> Check | None:
+        """Of levels that pass with the policy of level 0 the highest that passes with its own, among a few and 0; else what the last was refused for.
+
+        A policy that chooses asks the barrier, which a level moves.
+        """
+        last = None
+        for check in [*passed[::_STEP][:_TRIED], *(c for c in passed if abs(c.level) < 1e-6)]:
+            if abs(check.level) < 1e-6:
+                return check
+            fresh = self._held_out(work, work.agent(check.level))
+            if fresh is not None:
+                last = self._check(work, fresh, 0.0)
+                last.level = check.level
+                if last.passed:
+                    return last
+        return last
 
     def _missed(self, work: Workspace, held_out: _HeldOut, lowest: float) -> Check:
         """The check at level 0, with what was found at the lowest level, too, as its reason: no level between them keeps both U out and S in."""
@@ -191,7 +210,7 @@ class CheckRound(Phase):
             faults.append(f"innovations with a mean of up to {float(drift.max()):.2g}")
         passed = not faults and size > 0
         bad, out = (found for _, found, _ in mixed[:2])
-        return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults))
+        return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults), started=int(inside.sum()))
 
 
 class PlaceLevel(Phase):
