@@ -323,6 +323,18 @@ def test_untouched_certificate_verifies(issued):
     assert "OK" in text
 
 
+def test_a_certificate_of_networks_that_run_code_is_checked_on_request_alone(issued, tmp_path):
+    directory, made = copy_of(issued, tmp_path), tmp_path / "made"
+    body = json.loads((directory / "agent.json").read_text())
+    body["networks"]["encoder"] = {"class": "os:system", "arguments": {"latent_dim": f"touch {made}"}}
+    (directory / "agent.json").write_text(json.dumps(body))
+    for options in ({}, {"trust": True}, {"measure": True}):
+        lines: list[str] = []
+        assert verify_run(directory, report=lines.append, **options) == Exit.AGENT
+        assert ("runs code" in lines[0]) == (not options)
+    assert not made.exists()
+
+
 def nudge(directory) -> None:
     state = load_file(directory / "agent.safetensors")
     state["policy.net.0.weight"][0, 0] += 1e-6

@@ -18,14 +18,15 @@ from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import Certificate, Layer, Reason, weights_digest
-from torchrl_sspl.certification.record import Counts
+from torchrl_sspl.certification.record import Counts, Record
 from torchrl_sspl.certification.statistics import fingerprint
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation import blocks
 from torchrl_sspl.evaluation import certify as certify_module
 from torchrl_sspl.evaluation.blocks import described_system
 from torchrl_sspl.evaluation.certify import Exit, certify, certify_on_episodes, issue, verify_run
-from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.modules.agent import Agent, load
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import Box
 
@@ -371,6 +372,44 @@ def test_an_honest_certificate_of_resets_is_found_again(options, tmp_path):
     certify_on_episodes(agent, make, name="line", **settings).save(tmp_path / "certificate.json")
     lines: list[str] = []
     assert verify_run(tmp_path, env=make, report=lines.append) == Exit.HOLDS, "\n".join(lines)
+
+
+def test_an_agent_that_tolerates_errors_is_certified_at_the_level_that_it_keeps(tmp_path):
+    agent = line_agent()
+    certificate = certify(agent, None, name="line", level=-0.1, budget=SHORT)
+    agent.description["tolerated_error"] = 0.01
+    agent.save(tmp_path)
+    certificate.save(tmp_path / "certificate.json")
+    lines: list[str] = []
+    assert verify_run(tmp_path, report=lines.append) == Exit.REFUSED
+    assert "LEVEL" in lines[0]
+    with pytest.raises(ConfigError, match="expected 0 of an agent that tolerates errors"):
+        certify(agent, None, level=-0.1)
+    assert certify(agent, None, budget=SHORT).level == 0.0
+
+
+def test_measuring_all_again_fails_where_nothing_can_be_measured(tmp_path):
+    agent = line_agent()
+    agent.save(tmp_path)
+    certify(agent, Line(), name="line", episodes=20, horizon=2, acceptable=0.4, confidence=0.8, budget=SHORT).save(tmp_path / "certificate.json")
+    lines: list[str] = []
+    assert verify_run(tmp_path, report=lines.append) == Exit.HOLDS
+    assert any("at most 40 %, all of them together with 80 % confidence" in line for line in lines)
+    assert verify_run(tmp_path, measure=True, report=lines.append) == Exit.UNMEASURED
+    assert "NOT_MEASURED: its system was given in code" in lines[-1]
+    assert verify_run(tmp_path, env=Line(), measure=True, report=lines.append) == Exit.HOLDS
+
+
+def test_a_picture_of_u_that_looks_safe_counts_though_the_memory_knows_better():
+    class Lying(PendulumEnv):
+        def draw(self, state: Tensor) -> Tensor:
+            return super().draw(torch.where(state.abs()[:, :1] > 1.9, 0.0, state))
+
+    agent = load("pendulum")
+    source = blocks.ResetBlocks(agent, Lying, Record("resets", "given", 1, 40, 12, 20, 0.95, 0.01, []), 0.0, agent.tolerated_error)
+    counts = source(0).counts
+    assert counts.shown > 20
+    assert counts.mistaken > 0.4 * counts.shown
 
 
 def test_a_slow_machine_that_verifies_says_that_the_time_was_short(tmp_path, monkeypatch):

@@ -150,6 +150,30 @@ def test_weights_that_are_not_finite_are_named(saved, value):
 
 
 @pytest.mark.parametrize("part", ["encoder", "dynamics", "policy"])
+def test_what_is_no_network_is_never_called(saved, tmp_path, part):
+    made = tmp_path / "made"
+    edit(saved, lambda body: body["networks"].update({part: {"class": "os:system", "arguments": {"latent_dim": f"touch {made}"}}}))
+    with pytest.raises(CheckpointError, match="expected a class of networks"):
+        Agent.load(saved)
+    assert not made.exists()
+
+
+def test_networks_of_ones_own_are_not_imported_without_trust(saved, own_module):
+    edit(saved, lambda body: body["networks"]["encoder"].update({"class": f"{own_module}:Outer.Encoder"}))
+    with pytest.raises(CheckpointError, match="whose import runs code"):
+        Agent.load(saved, trust=False)
+    assert own_module not in sys.modules
+
+
+def test_weights_are_never_rounded(saved, tmp_path):
+    agent = Agent.load(saved).double()
+    with torch.no_grad():
+        agent.barrier[-1].bias += 1e-12
+    again = Agent.load(agent.save(tmp_path / "double"))
+    assert all(torch.equal(v, again.state_dict()[k]) and v.dtype == again.state_dict()[k].dtype for k, v in agent.state_dict().items())
+
+
+@pytest.mark.parametrize("part", ["encoder", "dynamics", "policy"])
 def test_unknown_network_class_lists_the_known_ones(saved, part):
     edit(saved, lambda body: body["networks"][part].update({"class": "Transformer"}))
     with pytest.raises(CheckpointError, match=rf"'{NETWORKS[part]['class']}'.*\], received 'Transformer'.*registries"):
