@@ -409,7 +409,7 @@ def test_a_picture_of_u_that_looks_safe_counts_though_the_memory_knows_better():
     source = blocks.ResetBlocks(agent, Lying, Record("resets", "given", 1, 40, 12, 20, 0.95, 0.01, []), 0.0, agent.tolerated_error)
     counts = source(0).counts
     assert counts.shown > 20
-    assert counts.mistaken > 0.4 * counts.shown
+    assert counts.mistaken > 0.52 * counts.shown  # 41 of 70; the memory is deceived in 32
 
 
 def test_a_slow_machine_that_verifies_says_that_the_time_was_short(tmp_path, monkeypatch):
