@@ -123,6 +123,7 @@ def on_shifts(agent: Agent, kernel: ViabilityKernel, n: int) -> dict[str, Any]:
             "uniform": scores(believed, safe),
             "uniform, believed by the monitor": scores(believed & ~alarm, safe),
             "unknown picture": float(alarm.float().mean()),
+            "unknown picture of a state outside U": float(alarm[~env.unsafe_set.contains(drawn)].float().mean()),
         }
     return found
 
@@ -177,16 +178,18 @@ def main() -> None:
     for name, found in body["agents"].items():
         agent = sspl.load(name)
         found["in the loop"] = in_the_loop(agent, env, kernel, given.episodes) if given.episodes else {}
-        print(f"\n{name}\n\n| episodes of {HORIZON} steps | enter U | claimed at the start | of these enter U |\n|---|---|---|---|")
+        print(f"\n{name}")
+        if found["in the loop"]:
+            print(f"\n| episodes of {HORIZON} steps | enter U | claimed at the start | of these enter U |\n|---|---|---|---|")
         for label, of in found["in the loop"].items():
             print(f"| {label} | {of['enter U']} of {of['episodes']} | {of['claimed']} | {of['of these enter U']} |", flush=True)
         found["shifts"] = on_shifts(agent, kernel, given.shifts) if given.shifts else {}
         if found["shifts"]:
-            print("\n| picture | LatentSafe F1 | F1 | unsafe called safe | the same, monitored | unknown pictures |\n|---|---|---|---|---|---|")
+            print("\n| picture | LatentSafe F1 | F1 | unsafe called safe | the same, monitored | unknown pictures | outside U |\n|---|---|---|---|---|---|---|")
         for label, of in found["shifts"].items():
             told = f"{rates(*PUBLISHED[label])['f1']:.3f}" if label in PUBLISHED else "-"
             miss, kept = (of[k]["unsafe_called_safe"] for k in ("uniform", "uniform, believed by the monitor"))
-            print(f"| {label} | {told} | {of['two headings']['f1']:.3f} | {100 * miss:.1f} % | {100 * kept:.1f} % | {100 * of['unknown picture']:.1f} % |", flush=True)
+            print(f"| {label} | {told} | {of['two headings']['f1']:.3f} | {100 * miss:.1f} % | {100 * kept:.1f} % | {100 * of['unknown picture']:.1f} % | {100 * of['unknown picture of a state outside U']:.1f} % |", flush=True)
     Path(given.out).write_text(json.dumps(body, indent=1) + "\n")
 
 
