@@ -327,7 +327,7 @@ class Experiment:
         try:
             self.trainer.train()
         except EmptyRegionError as error:
-            if self.phases.begun or self.trainer._optim_count:
+            if self.phases.begun:
                 raise
             few = "" if self.labels is None else "give labels of both (labels.safe, labels.unsafe, labels.share), "
             raise EmptyRegionError(

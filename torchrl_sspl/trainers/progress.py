@@ -155,7 +155,8 @@ def round_line(check: Any, episodes: int) -> str:
     head = f"round {check.round + 1}: "
     if not check.size:
         return f"{head}no safe set that passes was found ({check.reason or 'it is empty'})"
-    counts = f"of {f'{check.started:,}' if check.started else f'up to {episodes:,}'} held-out episodes {check.left:,} left it, {check.touched:,} entered U"
+    started = getattr(check, "started", 0)  # logs of earlier versions do not say
+    counts = f"of {f'{started:,}' if started else f'up to {episodes:,}'} held-out episodes {check.left:,} left it, {check.touched:,} entered U"
     proof = f"; the proof covers {100 * check.covered:.3g} % of them" if check.covered else ""
     verdict = "kept" if check.passed else f"not kept, because of: {check.reason}"
     back = f"{100 * check.returned:.3g} % of the starts in U came back"
