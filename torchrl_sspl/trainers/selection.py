@@ -63,8 +63,9 @@ class CheckRound(Phase):
     its pictures, as many more, changed as these are. A set is left from its rim, in the first steps, so many short episodes
     say more than few long ones. Where a proof is asked for, a level passes if the weights say that its set tolerates an
     error (branch and bound), the checks are made with the memory held in the set, and the proof applies to enough of the
-    episodes. A policy that chooses is simulated at the level at which it will run. An observer that believes itself more than what it sees keeps a constant innovation; a set is refused where
-    the mean innovation of an episode is larger than single ones under random actions ever are.
+    episodes. A policy that chooses is simulated at the level at which it will run. An observer that believes itself more than
+    what it sees keeps a constant innovation; a set is refused where the mean innovation of an episode is larger than single ones
+    under random actions ever are.
     Source: none; the paper stops at a total loss of zero.
     """
 
