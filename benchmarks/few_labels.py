@@ -35,7 +35,7 @@ import torch
 
 from torchrl_sspl.baselines import Budget, Needs, ScoreConfig, make, score
 from torchrl_sspl.baselines.cell import Cell
-from torchrl_sspl.baselines.sspl import SSPL, needs_of
+from torchrl_sspl.baselines.sspl import SSPL, needs_of, recorded_first
 from torchrl_sspl.configs.reader import compose, parse
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.measurements import Measurement
@@ -144,10 +144,9 @@ class Point:
         first, rim, own = (round(share * self.transitions) for share in (0.6, 0.2, 0.2))
         plan = [f"env={self.env}", f"seed={self.seed}", f"out_dir={directory / 'run'}", "logger=none", "trainer.progress=false", *QUADRUPED]
         plan += [f"synthesis.transitions={first}", f"synthesis.rim_transitions={rim}", f"synthesis.rollout_transitions={own}"]
-        batch, most = usual.collector.frames_per_batch, usual.trainer.total_frames
-        if first < most:  # the same steps of the optimiser, all of them when everything is recorded
-            frames, learning = -(-first // batch) * batch, most // batch - usual.random_frames() // batch + 1
-            plan += [f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={usual.trainer.optim_steps_per_batch * learning}"]
+        batch = usual.collector.frames_per_batch
+        if first < usual.trainer.total_frames:
+            plan += recorded_first(usual, -(-first // batch) * batch)
         plan += [f"evaluation.{name}={size}" for name in ("episodes", "horizon", "grid", "kernel_grid") if (size := getattr(sizes, name))]
         outcome = Experiment(compose([*plan, *words])).run()
         own_frames = outcome.evaluation.to_dict()

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchrl_sspl.baselines.base import Budget, Guarded, Needs, Nominal, SafetyMethod
 from torchrl_sspl.configs.reader import compose
+from torchrl_sspl.configs.schema import Config
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError
@@ -61,16 +62,27 @@ def settings(system: str, budget: Budget) -> list[str]:
             *plan, f"trainer.total_frames={min(frames, most)}", f"synthesis.transitions={first}",
             f"synthesis.rollout_transitions={rollouts}", "synthesis.near_draws=1", f"synthesis.rim_transitions={rim}",
         ]  # fmt: skip
-    # As many steps as the recommended settings take, all of them when everything is recorded.
-    learning = -(-most // batch) - -(-usual.random_frames() // batch) + 1
-    steps = usual.trainer.optim_steps_per_batch * learning
     return [
-        *plan, f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}",
-        f"buffer.capacity={max(frames, usual.buffer.capacity)}", f"synthesis.transitions={frames}", *_ONE_ROUND, "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
+        *plan, *recorded_first(usual, frames), f"buffer.capacity={max(frames, usual.buffer.capacity)}", f"synthesis.transitions={frames}", *_ONE_ROUND, "synthesis.rollout_transitions=0", "synthesis.rim_transitions=0",
         # A memory, and what is proved of it, are learnt from rollouts.
         "synthesis.gain=1.0", "synthesis.tolerated_error=0.0", "synthesis.cover_share=0.0",
         *(_PLAIN if usual.synthesis.steady_steps else []),
     ]  # fmt: skip
+
+
+def recorded_first(usual: Config, frames: int) -> list[str]:
+    """``key=value`` with which everything is recorded before the first step, and as many steps are taken as with the usual settings.
+
+    Source: none.
+
+    Example:
+        >>> recorded_first(compose(["env=quadruped"]), 640)[2]
+        'trainer.optim_steps_per_batch=30'
+    """
+    batch = usual.collector.frames_per_batch
+    learning = -(-usual.trainer.total_frames // batch) - -(-usual.random_frames() // batch) + 1
+    steps = usual.trainer.optim_steps_per_batch * learning
+    return [f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}"]
 
 
 def needs_of(counted: Mapping[str, int]) -> Needs:
