@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -9,6 +10,7 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Any
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 PATIENCE = 15.0
@@ -125,4 +127,34 @@ def end_if_pending() -> None:
         _watch.end()
 
 
-__all__ = ["Interrupted", "end_if_pending", "interruptible", "pending", "saving"]
+class TimeUp(Exception):
+    """The time for something is over. Source: none."""
+
+
+@contextmanager
+def time_limit(seconds: float) -> Iterator[None]:
+    """Raises TimeUp in the block after a while, where it can be interrupted (in the main thread, not on Windows). Source: none.
+
+    Example:
+        >>> with time_limit(60.0):
+        ...     1 + 1
+        2
+    """
+    usable = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
+    if not usable or not math.isfinite(seconds):
+        yield
+        return
+
+    def over(*_: Any) -> None:
+        raise TimeUp
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, before)
+
+
+__all__ = ["Interrupted", "TimeUp", "end_if_pending", "interruptible", "pending", "saving", "time_limit"]

@@ -148,7 +148,7 @@ MUTANTS = [
     (BLOCKS, "if not (isinstance(kind, type) and issubclass(kind, SafetyEnv)):", "if False:", f"{LOOPS}::test_the_system_of_a_description_is_one_of_the_library"),
     (CERTIFY, "s.kind if checked or s.kind == ASSUMED else \"claimed\"", "s.kind", f"{FORGED}::test_without_the_system_nothing_measured_is_printed_as_checked"),
     (CERTIFY, "except CheckpointError as error:\n        raise _Stop(Exit.AGENT", "except CheckpointError as error:\n        raise _Stop(Exit.REFUSED", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),
-    (CERTIFY, "signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))", "pass", f"{FORGED}::test_a_proof_that_does_not_end_is_interrupted"),
+    ("torchrl_sspl/interrupts.py", "signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))", "pass", f"{FORGED}::test_a_proof_that_does_not_end_is_interrupted"),
     (CERTIFY, "if not plain or not all(type(v) in (int, float)", "if not plain or not all(True or type(v) in (int, float)", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),
     (BLOCKS, "all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(seen(env), seen(twin), strict=True))", "True", f"{LOOPS}::test_a_system_is_compared_with_its_description"),
 ]  # fmt: skip

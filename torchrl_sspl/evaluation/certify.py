@@ -6,11 +6,8 @@ import json
 import math
 import random
 import re
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
@@ -55,6 +52,7 @@ from torchrl_sspl.evaluation.blocks import (
     summarise,
     summary_changes,
 )
+from torchrl_sspl.interrupts import TimeUp, time_limit
 from torchrl_sspl.journal import journal, kept
 from torchrl_sspl.modules.agent import Agent, agent_directory
 from torchrl_sspl.modules.choosing import ChoosingPolicy
@@ -364,10 +362,6 @@ def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> 
     }
 
 
-class _TimeUp(Exception):
-    """The time for a verification is over."""
-
-
 class _Stop(Exception):
     """A verification ends with a reason and an exit code."""
 
@@ -414,10 +408,10 @@ def verify_run(
     """
     directory = agent_directory(name)
     try:
-        with _limit(math.inf if measure else seconds):
+        with time_limit(math.inf if measure else seconds):
             _verify(directory, env, measure, trust or bool(measure), seconds, report)
         return int(Exit.HOLDS)
-    except _TimeUp:
+    except TimeUp:
         report(f"FAILED {Reason.UNDECIDED.name}: not checked within {seconds:g} s; give it more (seconds)")
         return int(Exit.TIME)
     except _Stop as stop:
@@ -427,26 +421,6 @@ def verify_run(
     except (*_BROKEN, AttributeError, ArithmeticError, LookupError, MemoryError) as error:
         report(f"FAILED the agent cannot be checked: {type(error).__name__}: {str(error)[:300]}")
         return int(Exit.AGENT)
-
-
-@contextmanager
-def _limit(seconds: float) -> Iterator[None]:
-    """Raises _TimeUp in the block after a while, where it can be interrupted (in the main thread, not on Windows)."""
-    usable = hasattr(signal, "setitimer") and threading.current_thread() is threading.main_thread()
-    if not usable or not math.isfinite(seconds):
-        yield
-        return
-
-    def over(*_: Any) -> None:
-        raise _TimeUp
-
-    before = signal.signal(signal.SIGALRM, over)
-    signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
 
 
 def _verify(
@@ -559,11 +533,12 @@ def _measured_again(
             changes = block_changes(record.blocks[index], blocks[index], record.kind == "resets")
             if changes:
                 _refuse({Reason.RECORD_CHANGED: f"block {index}: {changes}"})
-            if (time.monotonic() - began) * (1 + 1 / len(blocks)) > seconds and len(blocks) < len(order):
-                return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random", len(blocks)
-    except _TimeUp:
+            if (time.monotonic() - began) * (1 + 1 / len(blocks)) > seconds:
+                break
+    except TimeUp:
         if not blocks:
             raise
+    if len(blocks) < len(order):
         return f"{len(blocks)} of {len(order)} blocks of episodes, drawn at random", len(blocks)
     fresh = replace(record, blocks=list(record.blocks), sizes={}, numbers={}, rims=[])
     summarise(fresh, [blocks[k] for k in sorted(blocks)], agent)
