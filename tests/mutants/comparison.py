@@ -1,4 +1,4 @@
-"""Mutants of the comparison: what trials share and are worth, and how many transitions this library's own row takes."""
+"""Mutants of the comparison: what trials share and are worth, what rivals see, what this library's own row is given, and how its policy is checked."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ BASE, TUNING = "torchrl_sspl/baselines/base.py", "torchrl_sspl/baselines/tuning.
 CELL, TABLE, SCORING = (f"torchrl_sspl/baselines/{name}.py" for name in ("cell", "table", "scoring"))
 LATENT, VISION = "torchrl_sspl/baselines/latent_cbf.py", "torchrl_sspl/baselines/vision_cbf.py"
 
+PERCEPTION, NERF, PAGE = (f"torchrl_sspl/baselines/{name}.py" for name in ("perception", "nerf_cbf", "page"))
+CHOSEN = "tests/trainers/test_phases.py::test_a_policy_that_chooses_is_checked_at_the_level_at_which_it_runs"
+SELECTION, AGENT = "torchrl_sspl/trainers/selection.py", "torchrl_sspl/modules/agent.py"
 SYNTHESIS, OWN = "torchrl_sspl/trainers/synthesis.py", "torchrl_sspl/baselines/sspl.py"
 
 TRIED, LEARNT, SHOWN = (f"tests/baselines/test_{name}.py" for name in ("tuning", "rivals", "table"))
@@ -27,4 +30,21 @@ MUTANTS = [
     (SYNTHESIS, "range(s.near_draws)", "range(10)", LEARNT),
     (OWN, '"synthesis.near_draws=1", ', "", LEARNT),
     (OWN, "- rollouts) // s.rim_draws", "- rollouts)", LEARNT),
+    (OWN, "*settings(self.env_name, budget)", "*settings('pendulum', budget)", f"{LEARNT}::test_its_own_training_is_of_the_system_that_is_scored"),
+    (OWN, "steps = usual.trainer.optim_steps_per_batch * learning", "steps = usual.trainer.optim_steps_per_batch", f"{LEARNT}::test_this_librarys_own_row_takes_as_many_steps_as_recommended_whatever_the_budget"),
+    (OWN, 'for how in ("labels", "chosen labels")) for name', 'for how in ("labels",)) for name', LEARNT),
+    (CELL, "    if of != asked and {**of", "    if False and {**of", TRIED),
+    (TABLE, "if more := first.get", "if False and first.get", SHOWN),
+    (PERCEPTION, "if isinstance(env, CMUDubinsEnv):", "if False:", f"{LEARNT}::test_the_encoder_of_a_car_of_one_colour_tells_its_heading"),
+    (PERCEPTION, "ShapeEncoder(max(size, 4), pool_to=side) if whole else ", "", f"{LEARNT}::test_the_encoder_of_a_car_of_one_colour_tells_its_heading"),
+    (NERF, "self.view = env.half_view", "self.view = 1.2 * env.arena_half_size", LEARNT),
+    (VISION, "        view = self.env.half_view\n", "        view = 1.2 * self.env.arena_half_size\n", LEARNT),
+    (PAGE, "Path(env).stem", "env", f"{SHOWN}::test_a_page_has_systems_of_more_coordinates_and_systems_of_a_file"),
+    (SELECTION, "if isinstance(agent.policy, ChoosingPolicy) else", "if False else", CHOSEN),
+    (SELECTION, "work.agent(check.level)", "work.agent(0.0)", CHOSEN),
+    (SELECTION, "        check.level = level\n", "", CHOSEN),
+    (SELECTION, "started=int(inside.sum())", "started=0", CHOSEN),
+    (AGENT, "if name not in registry and not trust:", "if False:", "tests/modules/test_agent.py"),
+    (AGENT, "if not (isinstance(kind, type) and issubclass(kind, nn.Module)):", "if False:", "tests/modules/test_agent.py"),
+    (AGENT, "                agent.double()", "                pass", "tests/modules/test_agent.py"),
 ]

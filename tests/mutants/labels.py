@@ -20,6 +20,7 @@ MUTANTS = [
     (ASKING, "    told, unsafe = told.clone(), answer", "    told, unsafe = told, answer", ASKED),
     (ASKING, "0 if number else source.labels.choose", "source.labels.choose", ASKED),
     (ASKING, "        source.count_labels(answer[known", "        (answer[known", ASKED),
+    (ASKING, "if asked < count:", "if False:", ASKED),
     (ASKING, "z, code = seen[drawn], region[drawn]", "z, code = seen, region", ASKED),
     (ASKING, "_LIKELY = -4.0", "_LIKELY = 3.0", ASKED),
     (ASKING, "torch.where((region == UNLABELLED) & likely, UNSAFE", "torch.where(likely, UNSAFE", ASKED),

@@ -159,6 +159,37 @@ def test_rows_do_not_mix():
         assert torch.equal(one.margin[0], whole.margin[k])
 
 
+class Uneven(Moves):
+    """Whose results depend on how many rows there are, as those of products in floating point may in their last bits."""
+
+    def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return super().forward(latent, action) + 1e-4 * (len(latent) % 13)
+
+
+@pytest.mark.parametrize("mode", ["nearest", "blend"])
+def test_what_the_memory_is_given_is_what_was_checked(mode):
+    agent = line()
+    agent.dynamics = Uneven(1, 1)
+    latent, wanted = torch.linspace(-0.5, 0.6, 23)[:, None], torch.linspace(1.0, -1.0, 23)[:, None]
+    made = Shield(agent, mode=mode, level=0.0, margin=0.02)(latent, wanted)
+    assert bool(made.intervened.any())
+    assert torch.equal(made.margin, -0.02 - agent.barrier(made.predicted)[:, 0])
+    assert not torch.equal(made.predicted, agent.dynamics(latent, made.action))  # a second evaluation is another number
+    batch = TensorDict(pixels=latent, prior=latent, is_init=torch.ones(23, 1, dtype=torch.bool), action=wanted, batch_size=[23])
+    assert torch.equal(SafetyFilter(agent, mode=mode, level=0.0, margin=0.02)(batch)["next", "prior"], made.predicted)
+
+
+def test_the_wrappers_memory_is_given_what_was_checked():
+    wrapped = SafetyWrapper(Gym(), load("pendulum"))
+    wrapped.reset(seed=5)
+    guard, asked = wrapped._guard, torch.tensor([[4.0]])
+    made = guard.shield(guard._latent, asked)
+    made.predicted += 0.5
+    guard.shield = lambda latent, wanted: made
+    guard.protect(asked.numpy())
+    assert torch.equal(guard._controller.expected()[0], made.predicted)
+
+
 @pytest.mark.parametrize("options", [{"mode": "soft"}, {"level": 0.1}, {"margin": -0.1}, {"level": math.nan}])
 def test_options_that_are_none_are_refused(options):
     with pytest.raises(ConfigError, match="expected mode"):

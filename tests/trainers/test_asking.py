@@ -128,14 +128,16 @@ def test_a_run_asks_for_as_many_labels_as_it_may(tmp_path):
     assert int((latents["region"] == UNSAFE).sum()) > 5 * budget["labels of U"]
 
 
-@pytest.mark.parametrize(("number", "asked"), [(0, 5), (1, 0)])
-def test_labels_are_asked_for_in_the_first_round_alone(number, asked):
+@pytest.mark.parametrize(("number", "choose", "asked"), [(0, 5, 5), (1, 5, 0), (0, 38, 38), (0, 50, 38), (1, 50, 0)])
+def test_labels_are_asked_for_in_the_first_round_alone_and_too_few_are_told(number, choose, asked):
     seen, counted = torch.linspace(-1, 1, 40)[:, None], []
     told = torch.zeros(40, 1, dtype=torch.bool).index_fill(0, torch.tensor([0, 39]), True)
     latents = {"seen": seen, "told": told, "answer": torch.where(seen > 0, UNSAFE, SAFE)}
-    source = SimpleNamespace(labels=Labels(safe=1, unsafe=1, choose=5), count_labels=lambda answers: counted.append(len(answers)))
-    asking.tell_of_others(SimpleNamespace(latents=latents, source=source, seen_dim=1), number)
+    source = SimpleNamespace(labels=Labels(safe=1, unsafe=1, choose=choose), count_labels=lambda answers: counted.append(len(answers)))
+    work = SimpleNamespace(latents=latents, source=source, seen_dim=1, warnings=[])
+    asking.tell_of_others(work, number)
     assert counted == [asked]
+    assert work.warnings == (["all pictures have labels: 38 had none, and labels.choose asked for 50"] if choose == 50 and not number else [])
     assert int(latents["told"].sum()) == 2 + asked
 
 

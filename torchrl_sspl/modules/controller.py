@@ -226,19 +226,27 @@ class Controller:
         return step, agent.dynamics(latent, action)
 
     @torch.no_grad()
-    def took(self, action: Tensor) -> None:
+    def took(self, action: Tensor, predicted: Tensor | None = None) -> None:
         """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told.
+
+        Args:
+            action: what was done.
+            predicted: ``(n, p)``, what a safety filter has found to follow (``Protected.predicted``); None: it is computed.
 
         Raises:
             ConfigError: before the first step since a reset.
-            ShapeError: for actions of another shape.
+            ShapeError: for actions or latents of another shape.
         """
         if self._last is None:
             raise ConfigError("expected a step before took(), received none since the reset")
         latent, shape = self._last
         if action.shape != shape:
             raise ShapeError(f"expected actions {tuple(shape)}, received {tuple(action.shape)}")
-        self._memory.expect(self.agent.dynamics(latent, action), (~self.begins).nonzero()[:, 0])
+        if predicted is None:
+            predicted = self.agent.dynamics(latent, action)
+        elif predicted.shape != latent.shape:
+            raise ShapeError(f"expected latents {tuple(latent.shape)} after the actions, received {tuple(predicted.shape)}")
+        self._memory.expect(predicted, (~self.begins).nonzero()[:, 0])
 
 
 __all__ = ["Controller", "Memory", "Step", "correction", "meets_premise", "premise_met"]

@@ -34,6 +34,7 @@ class Protected:
     intervened: Tensor  # (n,) bool, whether it is another one than was wanted
     deviation: Tensor  # (n,) distance of the two, in half ranges of the action
     margin: Tensor  # (n,) barrier units by which the successor is surely inside; below zero where that is not so
+    predicted: Tensor  # (n, p) the successor, to the last bit the one that was checked: what a memory has to be given
 
 
 class Shield:
@@ -114,57 +115,58 @@ class Shield:
         if not bool(latent.isfinite().all()):
             raise NonFiniteError("latent: expected finite values, received NaN or infinity; an encoder gives those of finite weights alone")
         wanted = wanted.to(latent.dtype)
-        asked, own, taken, after_own, after, most, lost = self._first(latent, wanted, own)
+        asked, own, taken, then_own, then, most, lost = self._first(latent, wanted, own)
         if bool(lost.any()):
             # A graph is for one number of rows.
             rows = torch.arange(len(lost), device=lost.device) if self._compiled else lost.nonzero()[:, 0]
-            near, then = self._near(latent[rows], asked[rows], own[rows], after_own[rows], most[rows])
-            taken[rows], after[rows] = torch.where(lost[rows, None], near, taken[rows]), torch.where(lost[rows], then, after[rows])
+            near, then_near = self._near(latent[rows], asked[rows], own[rows], then_own[rows], most[rows])
+            taken[rows], then[rows] = (torch.where(lost[rows, None], a, b[rows]) for a, b in ((near, taken), (then_near, then)))
         change = (taken - wanted) / self.scale.to(wanted)
-        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self.level - self.margin - after)
+        return Protected(taken, (change != 0.0).any(1), change.norm(dim=1), self.level - self.margin - then[:, 0], then[:, 1:])
 
     def _judged(self, latent: Tensor, wanted: Tensor, own: Tensor | None) -> tuple[Tensor, ...]:
-        """Actions asked for, the agent's own, and those of the two that are taken; the barrier after its own and after the taken ones,
+        """Actions asked for, the agent's own, and those of the two that are taken; what follows its own and the taken ones,
         the most that is allowed; and for which rows another action is to be found."""
         scale = self.scale.to(wanted)
         asked = wanted.clamp(-scale, scale)
         own, inside = self.agent.policy(latent) if own is None else own, self.agent.barrier(latent)[:, 0] <= 0.0
-        after_own, after = self._after(latent.repeat(2, 1), torch.cat([own, asked])).chunk(2)
-        most = after_own.clamp(self.level - self.margin, -self.margin)
-        keeps = inside & ((after <= most) | (asked == own).all(1))  # [V] speaks of the agent's own
-        taken, after = torch.where(keeps[:, None], asked, own), torch.where(keeps, after, after_own)
-        return asked, own, taken, after_own, after, most, inside & ~keeps
+        then_own, then = self._then(latent.repeat(2, 1), torch.cat([own, asked])).chunk(2)
+        most = then_own[:, 0].clamp(self.level - self.margin, -self.margin)
+        keeps = inside & ((then[:, 0] <= most) | (asked == own).all(1))  # [V] speaks of the agent's own
+        taken, then = torch.where(keeps[:, None], asked, own), torch.where(keeps[:, None], then, then_own)
+        return asked, own, taken, then_own, then, most, inside & ~keeps
 
-    def _after(self, latent: Tensor, action: Tensor) -> Tensor:
-        """``(n,)`` barrier values of successors."""
-        return self.agent.barrier(self.agent.dynamics(latent, action))[:, 0]
+    def _then(self, latent: Tensor, action: Tensor) -> Tensor:
+        """``(n, 1 + p)`` barrier values of successors, and these: they go together, as in another batch they are others in the last bits."""
+        after = self.agent.dynamics(latent, action)
+        return torch.cat([self.agent.barrier(after), after], 1)
 
-    def _nearest(self, latent: Tensor, asked: Tensor, own: Tensor, after_own: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest actions tried that keep the set, and the barrier after them; the agent's own ones where none does."""
+    def _nearest(self, latent: Tensor, asked: Tensor, own: Tensor, then_own: Tensor, most: Tensor) -> tuple[Tensor, Tensor]:
+        """The nearest actions tried that keep the set, and what follows them; the agent's own ones where none does."""
         share = torch.linspace(0.0, 1.0, _LINE + 1, device=asked.device)[1:, None]
         tried = torch.lerp(asked[:, None], own[:, None], share)
         if self.mode == "nearest" and len(self.grid):
             tried = torch.cat([tried, self.grid.to(asked).expand(len(asked), -1, -1)], 1)
-        each, after = torch.arange(len(asked), device=asked.device), self._after_each(latent, tried)
-        keeps = after <= most[:, None]
+        each, after = torch.arange(len(asked), device=asked.device), self._then_each(latent, tried)
+        keeps = after[..., 0] <= most[:, None]
         distance = ((tried - asked[:, None]) / self.scale.to(asked)).norm(dim=-1).masked_fill(~keeps, float("inf"))
-        best, found = distance.argmin(1), keeps.any(1)
-        kept, after, lost = torch.where(found[:, None], tried[each, best], own), torch.where(found, after[each, best], after_own), asked
+        best, found = distance.argmin(1), keeps.any(1)[:, None]
+        kept, then, lost = torch.where(found, tried[each, best], own), torch.where(found, after[each, best], then_own), asked
         for _ in range(_ROUNDS):
             tried = torch.lerp(lost[:, None], kept[:, None], share)
-            then = self._after_each(latent, tried)
-            then[:, -1] = after  # known, and not to the last bit the same in another batch
-            keeps = then <= most[:, None]
+            after = self._then_each(latent, tried)
+            after[:, -1] = then  # known
+            keeps = after[..., 0] <= most[:, None]
             keeps[:, -1] = True
             first = keeps.int().argmax(1)
             lost = torch.where((first > 0)[:, None], tried[each, first - 1], lost)
-            kept, after = tried[each, first], then[each, first]
-        return kept, after
+            kept, then = tried[each, first], after[each, first]
+        return kept, then
 
-    def _after_each(self, latent: Tensor, actions: Tensor) -> Tensor:
-        """``(n, k)`` barrier values after actions ``(n, k, m)``."""
+    def _then_each(self, latent: Tensor, actions: Tensor) -> Tensor:
+        """``(n, k, 1 + p)`` what follows actions ``(n, k, m)``."""
         n, k, m = actions.shape
-        return self._after(latent.repeat_interleave(k, 0), actions.reshape(-1, m)).reshape(n, k)
+        return self._then(latent.repeat_interleave(k, 0), actions.reshape(-1, m)).reshape(n, k, -1)
 
 
 def _proved_margin(agent: Agent) -> float:
@@ -220,10 +222,9 @@ class SafetyFilter(TensorDictModuleBase):
         latent = seen["latent"]
         rows, wanted = latent.reshape(-1, latent.shape[-1]), tensordict["action"]
         made = self.shield(rows, wanted.reshape(-1, wanted.shape[-1]))
-        after = self.agent.dynamics(rows, made.action)
         found = {
             "latent": latent, "innovation": seen["innovation"], "action": made.action, "intervened": made.intervened[:, None],
-            "deviation": made.deviation[:, None], "safety_margin": made.margin[:, None], ("next", "prior"): after,
+            "deviation": made.deviation[:, None], "safety_margin": made.margin[:, None], ("next", "prior"): made.predicted,
         }  # fmt: skip
         for key, value in found.items():
             tensordict.set(key, value.reshape(*batch, value.shape[-1]))

@@ -251,12 +251,13 @@ class Monitor:
                 reasons[k].append(self.signals[which])
         return self._decided(step, signals, reasons)
 
-    def took(self, action: Tensor) -> None:
-        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told.
+    def took(self, action: Tensor, predicted: Tensor | None = None) -> None:
+        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told, and what a safety
+        filter has found to follow ``(n, p)``; else that is computed.
 
-        A ConfigError before the first step, a ShapeError for actions of another shape.
+        A ConfigError before the first step, a ShapeError for actions or latents of another shape.
         """
-        self._controller.took(action)
+        self._controller.took(action, predicted)
 
     def _looked(self, pixels: Tensor, prior: Tensor, begins: Tensor) -> tuple[Step, Tensor, dict[str, Tensor]]:
         """The controller's look, and the signals of the newest frame; nothing is remembered, so that it can be compiled."""

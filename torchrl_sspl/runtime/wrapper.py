@@ -161,7 +161,7 @@ class _Guard:
         made = self.shield(self._latent, asked)
         moves = torch.ones_like(made.intervened) if resting is None else ~torch.from_numpy(resting).to(made.intervened.device)
         action = torch.where(moves[:, None], made.action, asked)
-        self._controller.took(action)
+        self._controller.took(action, made.predicted)  # of a row that waits it is forgotten
         told = {
             "intervened": made.intervened & moves, "wanted": asked, "taken": action, "deviation": made.deviation * moves,
             "margin": made.margin,

@@ -43,7 +43,7 @@ def choose_and_spread(seen: Tensor, told: Tensor, answer: Tensor, count: int) ->
         seen: ``(n, p)`` latents of single pictures.
         told: ``(n,)`` bool, whose label is known.
         answer: ``(n,)`` codes of ``sets``; read only where a label is known or asked for.
-        count: labels that are asked for.
+        count: labels that are asked for, or all where there are fewer without one.
 
     Returns ``(n,)`` codes, in which only labels say S, and of which labels are known now, wrong ones among them, bool. Raises EmptyRegionError where nothing
     is told to be of U, or nothing not to be.
@@ -60,7 +60,8 @@ def choose_and_spread(seen: Tensor, told: Tensor, answer: Tensor, count: int) ->
     sides = int((told & unsafe).sum()), int((told & ~unsafe).sum())
     if 0 in sides:
         raise EmptyRegionError(
-            f"expected labels of U and of what is not of U, received {sides[0]} and {sides[1]}; raise labels.safe and labels.unsafe"
+            f"expected labels of U and of what is not of U, received {sides[0]} and {sides[1]}; record more of what is "
+            "missing (collector.starts, trainer.total_frames), or raise labels.unsafe and labels.safe"
         )
     for part in torch.arange(count).chunk(_ROUNDS):
         doubt = (-(_interpolated(seen, told, unsafe) / _DOUBT).square()).exp()
@@ -168,6 +169,9 @@ def tell_of_others(work: Workspace, number: int) -> None:
     if source.labels.choose:
         answer, count = data["answer"][:, 0], 0 if number else source.labels.choose
         region, known = choose_and_spread(seen, told, answer, count)
+        asked = int((known & ~told).sum())
+        if asked < count:
+            work.warnings.append(f"all pictures have labels: {asked:,} had none, and labels.choose asked for {count:,}")
         source.count_labels(answer[known & ~told])
         data["told"] = known[:, None]
     else:

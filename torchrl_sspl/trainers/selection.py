@@ -107,13 +107,18 @@ class CheckRound(Phase):
         for check in [*passed[::_STEP][:_TRIED], *(c for c in passed if abs(c.level) < 1e-6)]:
             if abs(check.level) < 1e-6:
                 return check
-            fresh = self._held_out(work, work.agent(check.level))
-            if fresh is not None:
-                last = self._check(work, fresh, 0.0)
-                last.level = check.level
+            held_out = self._held_out(work, work.agent(check.level))
+            if held_out is not None:
+                last = self._moved(work, held_out, check.level)
                 if last.passed:
                     return last
         return last
+
+    def _moved(self, work: Workspace, held_out: _HeldOut, level: float) -> Check:
+        """The check of an agent whose barrier was moved by a level: its set is the one of level 0."""
+        check = self._check(work, held_out, 0.0)
+        check.level = level
+        return check
 
     def _missed(self, work: Workspace, held_out: _HeldOut, lowest: float) -> Check:
         """The check at level 0, with what was found at the lowest level, too, as its reason: no level between them keeps both U out and S in."""
@@ -132,8 +137,8 @@ class CheckRound(Phase):
             fresh = self._held_out(work, agent) if tolerated > 0 else None
             if fresh is None:
                 continue
-            check = self._check(work, fresh, 0.0)
-            check.level, check.tolerated, check.covered = level, tolerated, self._covered(fresh.episodes, agent)
+            check = self._moved(work, fresh, level)
+            check.tolerated, check.covered = tolerated, self._covered(fresh.episodes, agent)
             if check.passed and check.covered >= s.cover_share:
                 return check
         return None

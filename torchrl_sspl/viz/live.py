@@ -258,7 +258,7 @@ class _View:
         wanted = self.held if self.random else out.action
         made = None if self.shield is None else self.shield(out.latent, wanted)
         taken = wanted if made is None else made.action
-        self.monitor.took(taken)
+        self.monitor.took(taken, None if made is None else made.predicted)
         intervened = made is not None and bool(made.intervened)
         counts["steps"] += 1
         counts["interventions"] += intervened
