@@ -17,7 +17,7 @@ from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.envs.dubins import YAW_LAG
 from torchrl_sspl.evaluation.controllers import as_controller
 from torchrl_sspl.evaluation.known import _Run, barrier_of, encode_states, evaluate, latency, states_where
-from torchrl_sspl.evaluation.measurements import Evaluation, quantiles, share
+from torchrl_sspl.evaluation.measurements import Evaluation, lipschitz, quantiles, share
 from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.modules.agent import load
 from torchrl_sspl.sets import Box
@@ -249,3 +249,13 @@ def test_nothing_here_asks_for_the_name_of_a_type():
             if isinstance(node, (ast.Compare, ast.Subscript, ast.Match)):
                 asked = [n for n in ast.walk(node) if isinstance(n, ast.Attribute) and n.attr in ("__name__", "__qualname__")]
                 assert not asked, f"{path.name}:{node.lineno}"
+
+
+def test_a_lipschitz_constant_is_certified_only_where_it_was_proved():
+    agent = load("pendulum")
+    for proved in (True, False, None):
+        agent.description["lipschitz"] = {} if proved is None else {"proved": proved}
+        out = Evaluation()
+        lipschitz(out, agent, torch.Generator().manual_seed(0))
+        assert out["lipschitz_certified"] == (agent.lipschitz_bound if proved else None)
+        assert out["lipschitz_sampled"] <= agent.lipschitz_bound

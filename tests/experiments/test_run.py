@@ -111,10 +111,12 @@ def nothing() -> SimpleNamespace:
 
 def test_without_success_it_starts_again_with_other_weights_and_says_so(tmp_path):
     words = ["trainer.total_frames=320", "trainer.restarts=2", "optim.lr=0.0", "synthesis.enabled=false", UNSAVED]
-    experiment = build(tmp_path, *words)
-    starts = []
+    experiment = build(tmp_path, *words, "network.encoder=ContrastEncoder")
+    starts, fitted = [], []
     experiment.trainer.register_op("post_steps", lambda: starts.append(next(experiment.encoder.parameters()).sum().item()))
+    experiment.trainer.register_op("post_steps", lambda: fitted.append(bool((experiment.encoder.trunk[0].background == -1).any())))  # 1 before
     experiment.train()
+    assert all(fitted)  # what an encoder knows of the frames is not lost with its weights
     assert experiment.trainer.optimization_stepper.count == 2 * 3  # batches 1, 2, 3 to 5
     assert (len(starts), len(set(starts))) == (5, 3)
     assert any("did not tell S from U" in text for text in experiment._warnings(nothing()))
@@ -136,7 +138,7 @@ def test_a_start_that_still_improves_is_not_given_up():
             self.register_buffer("dynamics_margin", torch.tensor(value))
 
     stepper = SSPLStepper(torch.optim.Adam([nn.Parameter(torch.zeros(1))]), warm_start_error=0.05)
-    trainer = SimpleNamespace(optimization_stepper=stepper, loss_module=Loss(0.0))
+    trainer = SimpleNamespace(optimization_stepper=stepper, loss_module=Loss(0.0), fit_encoder=None)
     hook = RestartHook(trainer, lambda attempt: Loss(float(attempt)), after=100, most=2)
     for count, mislabelled, restarts in (
         (0, 2.0, 0),  # nothing was done yet

@@ -555,3 +555,14 @@ def test_training_sees_no_state(uninterrupted):
     assert set(found.work.latents) == {"latent", "next_latent", "action", "region", "seen", "next_seen", "continues"}
     assert ("info", "state") not in found.store.get(torch.arange(2)).keys(True)
     assert not found.store.keep_state
+
+
+def test_steps_of_a_phase_keep_a_bounded_barrier_inside_its_cone():
+    from torchrl_sspl.lipschitz import LMIBarrier
+
+    torch.manual_seed(0)
+    barrier, loop = LMIBarrier(1, (8, 8), 0.5), InnerLoop(0)
+    ends = torch.tensor([[-1.0], [1.0]])
+    loop(60, {nn.ModuleList([barrier]): 0.1}, lambda: {"loss_slope": -barrier(ends).diff(dim=0).sum()})
+    assert barrier.feasible()
+    assert 0.1 < float(barrier(ends).detach().diff(dim=0)) / 2 <= 0.5

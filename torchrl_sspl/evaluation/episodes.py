@@ -9,9 +9,8 @@ import torch
 
 from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.evaluation.controllers import AgentController, RandomController, as_controller
-from torchrl_sspl.evaluation.measurements import Evaluation, MakeEnv, Measurement, quantiles
+from torchrl_sspl.evaluation.measurements import Evaluation, MakeEnv, Measurement, lipschitz, quantiles
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
-from torchrl_sspl.lipschitz import lipschitz_lower
 from torchrl_sspl.sets import SAFE, UNSAFE
 
 _CALLED = {"unsafe_called_safe": UNSAFE, "safe_called_unsafe": SAFE}
@@ -88,11 +87,7 @@ def evaluate_episodes(
         error = None if episodes.prediction_error is None else episodes.prediction_error[episodes.alive[1:]]
         quantiles(out, name, error, "latent", "error of a step")
     if isinstance(acts, AgentController):
-        bound, generator = acts.agent.lipschitz_bound, torch.Generator().manual_seed(config.seed)
-        lower = lipschitz_lower(acts.agent.barrier, -1.0, 1.0, n=20000, generator=generator)
-        out.add(Measurement("lipschitz_certified", bound, "barrier / latent", note="bound of the barrier"))
-        note = "largest gradient or secant found"
-        out.add(Measurement("lipschitz_sampled", lower, "barrier / latent", 20000, note=note))
+        lipschitz(out, acts.agent, torch.Generator().manual_seed(config.seed))
     out.arrays.update(own=own, chance=chance)
     return out
 

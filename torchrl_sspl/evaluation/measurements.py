@@ -7,10 +7,13 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
+import torch
 from torch import Tensor
 from torchrl.envs import EnvBase
 
 from torchrl_sspl.certification.statistics import clopper_pearson
+from torchrl_sspl.lipschitz import lipschitz_lower
+from torchrl_sspl.modules.agent import Agent
 
 _CONFIDENCE = 0.95
 
@@ -99,3 +102,17 @@ def quantiles(out: Evaluation, name: str, values: Tensor | None, unit: str, note
     q99, q999 = (ordered[min(n - 1, math.ceil(q * n) - 1)] for q in (0.99, 0.999))
     for label, value in (("q99", q99), ("q999", q999), ("mean", ordered.mean()), ("max", ordered[-1])):
         out.add(Measurement(f"{name}_{label}", float(value), unit, n, note=note))
+
+
+def lipschitz(out: Evaluation, agent: Agent, generator: torch.Generator) -> float:
+    """Adds the bound of an agent's barrier, where it was proved, and the largest slope that is found; returns the latter, in barrier / latent.
+
+    A bound that an agent only claims is not measured. Source: none.
+    """
+    lower, unit = lipschitz_lower(agent.barrier, -1.0, 1.0, n=20000, generator=generator), "barrier / latent"
+    if agent.description.get("lipschitz", {}).get("proved"):
+        out.add(Measurement("lipschitz_certified", agent.lipschitz_bound, unit, note="proved for the deployed weights"))
+    else:
+        out.missing("lipschitz_certified", unit=unit, note=f"claimed to be {agent.lipschitz_bound:g}, not proved")
+    out.add(Measurement("lipschitz_sampled", lower, unit, 20000, note="largest gradient or secant found"))
+    return lower

@@ -75,7 +75,8 @@ class Agent(nn.Module):
         barrier: latent ``(*batch, p)`` -> ``(*batch, 1)``; at most zero means safe.
         policy: latent ``(*batch, p)`` -> action ``(*batch, m)`` in physical units (N m, rad/s); a
             :class:`~torchrl_sspl.modules.ChoosingPolicy` chooses by this agent's dynamics and barrier.
-        lipschitz_bound: the proved Lipschitz constant of ``barrier`` with respect to the Euclidean norm.
+        lipschitz_bound: Lipschitz constant of ``barrier`` with respect to the Euclidean norm, as claimed; whether it was proved is in
+            ``description["lipschitz"]``, and ``sspl verify`` proves it anew.
         description: how to build the networks again, and whatever else should travel with the agent;
             ``"tolerated_error"`` is the error below which its proof applies at run time.
         gain: K of the latent observer, a number or ``(p, p)``; 1: the latent is what is seen.

@@ -271,6 +271,8 @@ class RestartHook(_Hook):
         for name, value in margins.items():
             getattr(loss, name).copy_(value)
         stepper.restart()
+        if self.trainer.fit_encoder is not None:  # at this stage it has been asked already, and the steps that follow count
+            self.trainer.fit_encoder()
 
     def log(self, batch: TensorDictBase | None) -> dict[str, Any]:
         """The number of fresh starts so far."""

@@ -94,6 +94,7 @@ class InnerLoop:
         total = 11 if steps == 10 else max(steps, 2)
         cycle = torch.optim.lr_scheduler.OneCycleLR(adam, list(networks.values()), total_steps=total, pct_start=0.1)
         parameters = [p for m in networks for p in m.parameters()]
+        bounded = [part for m in networks for part in m.modules() if hasattr(part, "backtracking_step")]
         if self._saved is None:
             torch.manual_seed(int(torch.randint(2**31, (1,), generator=self.generator)))
         else:
@@ -108,7 +109,10 @@ class InnerLoop:
             for p in parameters:
                 p.grad = None
             objective.backward()  # type: ignore[union-attr]
+            before = [{k: v.clone() for k, v in part.state_dict().items()} for part in bounded]
             adam.step()
+            for part, state in zip(bounded, before, strict=True):
+                part.backtracking_step(state)  # its Lipschitz bound holds inside a cone alone
             cycle.step()
             self.step += 1
             self._terms = {k: v.detach() for k, v in terms.items()}

@@ -168,6 +168,7 @@ class SSPLTrainer(Trainer):
         self._log_dict: Any = defaultdict(partial(deque, maxlen=1))  # else all that was ever logged
         self.phases, self.clock, self.show_progress, self.resumed = phases, ClockHook(), progress_bar, False
         self._bar, self._joint = Progress(0, 0, shown=False), False
+        self.fit_encoder: FitEncoderHook | None = None
         self._out_dir = None if out_dir is None else Path(out_dir)
         self._register(replay_buffer, margins, rollout_policy, None if out_dir is None else Path(out_dir) / LOG_FILE)
         if evaluate is not None:
@@ -215,7 +216,8 @@ class SSPLTrainer(Trainer):
         encoder = getattr(loss.encoder, "module", None)
         store = getattr(replay_buffer, "storage", None)
         if callable(getattr(encoder, "fit", None)) and hasattr(store, "n_frames"):
-            FitEncoderHook(self, encoder, store).register(self)
+            self.fit_encoder = FitEncoderHook(self, encoder, store)
+            self.fit_encoder.register(self)
         if margins is not None:
             margins.register(self)
         SeedHook(self.collector).register(self)
