@@ -66,6 +66,9 @@ def test_a_good_set_passes_and_is_measured():
     assert found.returned == 0.5
 
 
+INSIDE = [-0.3, -0.2, -0.2]
+
+
 def values(n: int, **changed: float) -> Tensor:
     value = torch.full((n,), changed["usual"])
     value[3] = changed["one"]
@@ -81,8 +84,11 @@ def values(n: int, **changed: float) -> Tensor:
         ({"episodes": episodes([[-0.4, 0.1, -0.3], [-0.3, -0.2, -0.2]])}, "left 1"),  # and coming back does not help
         ({"episodes": episodes([[0.1, 0.2, 0.3], [-0.3, -0.2, -0.2]])}, ""),  # it did not start inside
         ({"episodes": episodes([[-0.4, -0.4, -0.3]], [[0, 0, UNSAFE]])}, "touched U 1"),
-        ({"episodes": episodes([[0.3, -0.1, 0.2]], [[0, 0, UNSAFE]])}, "touched U 1"),  # it was inside on the way
-        ({"episodes": episodes([[0.3, 0.2, -0.1]], [[0, UNSAFE, 0]])}, ""),  # U came first: a return
+        ({"episodes": episodes([[0.3, -0.1, 0.2], INSIDE], [[0, 0, UNSAFE], [0, 0, 0]])}, "touched U 1"),  # it was inside on the way
+        ({"episodes": episodes([[0.3, 0.2, -0.1], INSIDE], [[0, UNSAFE, 0], [0, 0, 0]])}, ""),  # U came first: a return
+        ({"episodes": episodes([[0.3, 0.2, -0.1]])}, "0 of 1 episodes start in the set, too few to tell"),
+        ({"episodes": episodes([[0.3, 0.2, 0.1]] * 39 + [INSIDE])}, "1 of 40 episodes start in the set, too few to tell"),
+        ({"episodes": episodes([[0.3, 0.2, 0.1]] * 38 + [INSIDE] * 2)}, ""),
         ({"anywhere": torch.tensor([0.3, 0.4]), "episodes": episodes([[0.3, 0.3, 0.3]])}, None),  # nothing is in it
     ],
 )

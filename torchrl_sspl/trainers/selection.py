@@ -26,6 +26,7 @@ _MOST_OF_MARGIN = 0.6  # of the condition's margin that the level may take away 
 _UNSAFE_DRAWS = 128_000  # fresh observations of U, at most
 _STEP, _TRIED = 2, 6  # levels between two for which a proof is tried, and how many of these
 _BACK = (1000, 80)  # episodes from U, at most, and their steps, at least
+_STARTED = 20  # the most of this many episodes of which one has to start in the set
 _Count = tuple[str, int, float]  # of what, how many, and how many there may be
 
 
@@ -208,15 +209,17 @@ class CheckRound(Phase):
         touched = int(((run.barrier <= level) & late).any(0).sum())
         mixed = self._mixed(work, held_out, level)
         returned = float(((back.barrier[-1] <= level) & (back.region[-1] != UNSAFE)).float().mean())
-        size = float((held_out.anywhere <= level).float().mean())
         counts = (*mixed, ("left", left, s.leave_share * int(inside.sum())), ("touched U", touched, 0))
         faults = [f"{name} {found}" for name, found, most in counts if found > most]
+        started, size = int(inside.sum()), float((held_out.anywhere <= level).float().mean())
+        if size > 0 and started < max(1, len(run) // _STARTED):  # of a set that nothing starts in nothing was seen
+            faults.append(f"{started} of {len(run)} episodes start in the set, too few to tell")
         drift = held_out.drift[inside]
         if bool((drift > held_out.largest_innovation).any()):
             faults.append(f"innovations with a mean of up to {float(drift.max()):.2g}")
         passed = not faults and size > 0
         bad, out = (found for _, found, _ in mixed[:2])
-        return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults), started=int(inside.sum()))
+        return Check(self.number, level, bad, out, left, touched, returned, size, passed, ", ".join(faults), started=started)
 
 
 class PlaceLevel(Phase):
