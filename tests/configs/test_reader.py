@@ -404,7 +404,7 @@ def test_reading_a_configuration_loads_no_environment():
     [
         ("synthesis.grid=1", "at least 3 nodes"), ("synthesis.grid=41", "synthesis.teacher=value"),
         ("synthesis.rollout_transitions=0", "rollout_transitions >= 1 with synthesis.rounds=2"), ("evaluation.horizon=0", "evaluation.horizon >= 1"),
-        ("evaluation.certificate_seconds=-1", "evaluation.certificate_seconds >= 0"), ("seed=-1", "seed >= 0"), ("synthesis.batch=0", "synthesis.batch >= 1"),
+        ("evaluation.certificate_seconds=-1", "evaluation.certificate_seconds >= 0"), ("seed=-1", "seed >= 0"), ("synthesis.batch=0", "synthesis.batch >= 4"),
         ("synthesis.dynamics_outlier=-0.1", "synthesis.dynamics_outlier >= 0"), ("synthesis.episode_steps=-3", "synthesis.episode_steps >= 1"),
         ("synthesis.lowest_level=0.1", "between -0.2 and 0"),
     ],

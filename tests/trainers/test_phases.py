@@ -36,7 +36,7 @@ from torchrl_sspl.trainers import (
     targets,
 )
 from torchrl_sspl.trainers.phases import action_grid
-from torchrl_sspl.trainers.targets import _grid_targets, _inside, _signed_distance
+from torchrl_sspl.trainers.targets import _grid_targets, _inside, _signed_distance, observed_errors
 from torchrl_sspl.viability import viability_kernel
 from torchrl_sspl.viability.grid import Grid
 
@@ -566,3 +566,14 @@ def test_steps_of_a_phase_keep_a_bounded_barrier_inside_its_cone():
     loop(60, {nn.ModuleList([barrier]): 0.1}, lambda: {"loss_slope": -barrier(ends).diff(dim=0).sum()})
     assert barrier.feasible()
     assert 0.1 < float(barrier(ends).detach().diff(dim=0)) / 2 <= 0.5
+
+
+@pytest.mark.parametrize(("spread", "error"), [(1.5, 0.01), (0.0, 0.01), (1.5, 0.0)])
+def test_an_error_that_is_to_be_tolerated_is_tolerated_whatever_was_observed(spread, error):
+    g = torch.Generator().manual_seed(0)
+    z = torch.rand(200, 2, generator=g)
+    data = {"latent": z, "action": z[:, :1], "next_latent": z + error * torch.randn(200, 2, generator=g)}
+    config = SynthesisConfig(tolerated_error=0.05, residual_spread=spread)
+    work = SimpleNamespace(latents=data, config=config, dynamics=lambda z, u: z)
+    _, axes = observed_errors(work, z, g, spread)
+    torch.testing.assert_close((axes[:, 1:] - axes[:, :1]).norm(dim=-1), torch.full((200, 2), 1.25 * 0.05))

@@ -5,12 +5,14 @@
 from __future__ import annotations
 
 import dataclasses
+import operator
 from dataclasses import dataclass, field
 from typing import Any
 
 from torchrl_sspl.errors import ConfigError
 
 BACKENDS = ("sync", "process", "ray")
+RESIDUALS = 64  # observed errors nearby from which those of a latent are taken
 LOWEST_LEVEL = -0.2  # to which held-out checks may shift the barrier
 PRESETS = ("sound", "paper", "quick", "smoke")
 _CHOICES = {
@@ -28,10 +30,18 @@ _LEAST = {
     0: "seed evaluation.seed evaluation.walk_seed evaluation.episodes evaluation.walks evaluation.renderer_episodes evaluation.grid "
     "evaluation.kernel_grid evaluation.certificate_episodes evaluation.certificate_seconds synthesis.steady_steps synthesis.dynamics_steps "
     "synthesis.teach_steps synthesis.fit_steps synthesis.steer_steps synthesis.tune_steps synthesis.tighten_steps synthesis.dynamics_outlier "
-    "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices synthesis.retries",
-    1: "evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.batch synthesis.residuals synthesis.actions "
+    "synthesis.tolerated_error synthesis.rollout_transitions synthesis.rim_transitions synthesis.counterexamples synthesis.choices synthesis.retries "
+    "synthesis.guard synthesis.leave_share synthesis.safe_share synthesis.cover_share synthesis.return_share synthesis.margin synthesis.unsafe_margin "
+    "synthesis.unsafe_weight synthesis.exploration synthesis.residual_spread synthesis.teach_spread synthesis.recovery_coeff synthesis.change_coeff "
+    "synthesis.choice_margin synthesis.lr optim.lr optim.weight_decay",
+    1: "network.latent_dim evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.residuals synthesis.actions "
     "synthesis.rim_draws synthesis.near_draws synthesis.check_episodes synthesis.check_horizon",
-    4: "synthesis.turns",
+    4: "synthesis.turns synthesis.batch",
+}
+_ABOVE = {0: "network.lipschitz_bound synthesis.band evaluation.walk_seconds"}
+_MOST = {
+    1: "synthesis.leave_share synthesis.safe_share synthesis.cover_share synthesis.return_share",
+    RESIDUALS: "synthesis.residuals",
 }
 
 
@@ -219,7 +229,7 @@ class SynthesisConfig:
     tolerated_error: float = _option(0.0, "error per step that the set is meant to be proved to tolerate, latent units: the "
         "invariant set of the data keeps a quarter more, the fine-tuning requires the condition under the worst error of this size, and "
         "then the training uses counterexamples of the proof. 0: residual_spread counts, and the proof is not considered.")
-    residuals: int = _option(16, "observed errors of the dynamics per latent that the fine-tuning adds to successors.")
+    residuals: int = _option(16, "observed errors of the dynamics per latent that the fine-tuning adds to successors, at most 64.")
     residual_spread: float = _option(1.5, 'standard deviations of the local error that the invariant set of the data '
         'tolerates; with teacher "value" lowered by quarters where nine tenths of S could not be kept otherwise.')
     actions: int = _option(7, "actions per dimension tried at every latent.")
@@ -240,7 +250,7 @@ class SynthesisConfig:
     tighten_steps: int = _option(2000, "steps on counterexamples of the proof, where tolerated_error or grid is positive.")
     margin: float = _option(0.1, "margin m of the condition R3, B <= 0 implies B(d(z, pi(z))) + m <= 0.")
     band: float = _option(0.1, "barrier value up to which R3 is asked.")
-    batch: int = _option(512, "latents per step.")
+    batch: int = _option(512, "latents per step, at least 4.")
     lr: float = _option(1e-3, "peak learning rate of the fine-tuning.")
     counterexamples: int = _option(256, "latents of the whole domain at which the condition fails that each search "
         "adds to the batches of the fine-tuning (0: off).")
@@ -372,7 +382,7 @@ class Config:
         self._check_labels()
         if self.synthesis.rounds < 1:
             raise ConfigError(f"expected synthesis.rounds >= 1, received {self.synthesis.rounds}; synthesis.enabled=false for none")
-        self._check_least()
+        self._check_bounds()
         s = self.synthesis
         if s.grid and (s.grid < 3 or s.teacher != "value"):
             raise ConfigError(
@@ -398,13 +408,17 @@ class Config:
                 "takes its label with it, and no other one is given"
             )
 
-    def _check_least(self) -> None:
-        for least, keys in _LEAST.items():
-            for key in keys.split():
-                section, _, name = key.rpartition(".")
-                value = getattr(getattr(self, section) if section else self, name)
-                if value is not None and not value >= least:
-                    raise ConfigError(f"expected {key} >= {least}, received {value}")
+    def _check_bounds(self) -> None:
+        for sign, holds, bounds in ((">=", operator.ge, _LEAST), (">", operator.gt, _ABOVE), ("<=", operator.le, _MOST)):
+            for bound, keys in bounds.items():
+                for key in keys.split():
+                    section, _, name = key.rpartition(".")
+                    value = getattr(getattr(self, section) if section else self, name)
+                    if value is not None and not holds(value, bound):
+                        raise ConfigError(f"expected {key} {sign} {bound}, received {value}")
+        for key, grid in (("grid", self.evaluation.grid), ("kernel_grid", self.evaluation.kernel_grid)):
+            if grid == 1:
+                raise ConfigError(f"expected evaluation.{key} of 0 (the system's own) or at least 2, received 1")
 
 
 __all__ = [

@@ -15,6 +15,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from torchrl_sspl.configs.schema import RESIDUALS
 from torchrl_sspl.direction import charted, lifted, within
 from torchrl_sspl.journal import journal, kept
 from torchrl_sspl.modules.networks import mlp
@@ -99,11 +100,15 @@ def observed_errors(work: Workspace, latent: Tensor, generator: torch.Generator,
     with torch.no_grad():
         residual = data["next_latent"] - work.dynamics(z, data["action"])
     sample = torch.randperm(len(z), generator=generator)[:30000]
-    near, axes = nearby_residuals(latent, z[sample], residual[sample], count=work.config.residuals, spread=spread)
-    if work.config.tolerated_error > 0:
+    tolerated = work.config.tolerated_error
+    spread = spread or float(tolerated > 0)  # of that the direction is needed, whatever its length
+    near, axes = nearby_residuals(latent, z[sample], residual[sample], count=work.config.residuals, spread=spread, neighbours=RESIDUALS)
+    if tolerated > 0:
         # The direction is what was observed, the length what is to be tolerated, and room for what a network does not fit.
         mean, ends = axes[:, :1], axes[:, 1:] - axes[:, :1]
-        length = _ROOM * work.config.tolerated_error / ends.norm(dim=-1, keepdim=True).clamp_min(1e-9)
+        either_way = torch.eye(1, ends.shape[-1]) * torch.tensor([[1.0], [-1.0]])  # where nothing was observed
+        ends = torch.where(ends.norm(dim=-1, keepdim=True) > 0.0, ends, either_way)
+        length = _ROOM * tolerated / ends.norm(dim=-1, keepdim=True).clamp_min(1e-9)
         axes = torch.cat([mean, mean + length * ends], dim=1)
     return near, axes
 
