@@ -102,6 +102,7 @@ def test_the_program_of_the_page_is_one():
     env.close()
 
 
+@pytest.mark.slow  # as of every run that stops and goes on
 def test_the_same_seed_gives_the_same_agent(example, tmp_path):
     module = example("bring_your_own_cartpole.py")
     agents = [Experiment(compose([*TINY, f"out_dir={tmp_path / k}"]), module.my_env).train() for k in "ab"]

@@ -57,6 +57,7 @@ def test_every_phase_of_both_rounds_was_run(trained):
         assert {"dynamics", "fit", "steer", "tune", "check"} <= {row["phase"] for row in rows if row["round"] == k}
 
 
+@pytest.mark.slow  # as of every finished run
 def test_started_again_it_is_not_trained_again(program, trained, tmp_path, capsys):
     directory = shutil.copytree(trained[1], tmp_path / "again")
     weights, log = (directory / "agent" / "agent.safetensors").read_bytes(), (directory / "log.jsonl").read_bytes()
