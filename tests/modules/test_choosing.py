@@ -10,13 +10,16 @@ import pytest
 import torch
 from choosing import LEFT_OR_RIGHT, chosen_by_hand, linear, road, road_barrier, road_dynamics, steering
 from safetensors.torch import load_file
+from tensordict import TensorDict
 from torch import nn
 
 import torchrl_sspl.modules.agent as agents
+from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.lipschitz import SandwichBarrier
 from torchrl_sspl.modules import ChoosingPolicy, FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.modules.agent import Agent
+from torchrl_sspl.trainers import FineTune, Workspace
 
 
 def points(n: int, p: int = 2, seed: int = 0) -> torch.Tensor:
@@ -206,3 +209,40 @@ def test_actions_that_rounding_decides_between_are_no_difference_of_an_exported_
     assert not bool(_tied(agent, left, left, 1.0).any())
     agent.policy = agent.policy.policy
     assert not bool(_tied(agent, left, right, 1.0).any())
+
+
+def test_the_worst_error_of_the_fine_tuning_is_that_after_the_action_that_is_taken(monkeypatch):
+    class Line(nn.Module):
+        latent_dim = action_dim = 1
+        action_scale = torch.tensor([0.3])
+
+        def __init__(self, value=None):
+            super().__init__()
+            self.value = nn.Parameter(torch.tensor([value or 0.0]))
+
+    class Adds(Line):
+        def forward(self, latent, action):
+            return latent + action
+
+    class Hill(Line):
+        lipschitz_bound = 1.0
+
+        def forward(self, latent):
+            return 0.2 - (latent - 0.05).abs() + self.value
+
+    class Same(Line):
+        def forward(self, latent):
+            return 0 * latent + self.value
+
+    config = SynthesisConfig(batch=16, tune_steps=1, counterexamples=0, choices=3, tolerated_error=0.02, lr=1e-9)
+    work = Workspace(nn.Linear(1, 1), Adds(), Hill(), Same(0.02), config=config)  # its own action ends on one side of the hill, the chosen one on the other
+    z, n = torch.full((50, 1), 0.04), 50
+    table = TensorDict(
+        latent=z, barrier_target=z - 0.2, inside=z > 0, action_target=0 * z, action_weight=1 + 0 * z, region=2 * (torch.arange(n)[:, None] < 5).long(), batch_size=n
+    )
+    rim, added = TensorDict(latent=z, residual=torch.zeros(n, 16, 1), batch_size=n), []
+    monkeypatch.setattr("torchrl_sspl.trainers.synthesis.targets", lambda work, number: (table, rim))
+    monkeypatch.setattr("torchrl_sspl.trainers.synthesis.worst_error", lambda barrier, after, most: added.append(after) or 0 * after)
+    FineTune(0).run(work)
+    torch.testing.assert_close(added[0], work.dynamics(z[:1], work.acting(z[:1])).detach().expand_as(added[0]))
+    assert not torch.allclose(added[0], work.dynamics(z[:1], work.policy(z[:1])))

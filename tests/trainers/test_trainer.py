@@ -24,6 +24,7 @@ from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError
 from torchrl_sspl.lipschitz import LMIBarrier, SandwichBarrier
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy, make_rollout_policy
 from torchrl_sspl.objectives import LipschitzLoss, SSPLLoss
+from torchrl_sspl.trainers import Phase, Phases, Workspace
 from torchrl_sspl.trainers.hooks import EveryHook, MarginHook
 from torchrl_sspl.trainers.stepper import SSPLStepper
 from torchrl_sspl.trainers.trainer import SSPLTrainer
@@ -242,6 +243,32 @@ def test_evaluation_is_logged_and_can_stop_the_training(tmp_path: Path) -> None:
     plain = build(batches=4)
     plain.train()
     assert_same(weights(plain), weights(trainer))
+
+
+def test_a_training_that_was_ended_goes_through_its_phases_and_stays_ended(tmp_path: Path) -> None:
+    class Mark(Phase):
+        name = "mark"
+
+        def run(self, work: Any) -> None:
+            ran.append(len(seen))
+
+    def made() -> SSPLTrainer:
+        networks = LatentDynamics(2, 1, (8,)), SandwichBarrier(2, (8,)), Policy(2, 1, (8,))
+        return build(tmp_path, evaluate=evaluate, phases=Phases([Mark()], Workspace(FrameEncoder(2, pool_to=8), *networks)))
+
+    def evaluate(trainer: SSPLTrainer) -> dict[str, Any]:
+        seen.append(trainer.collected_frames)
+        return {"stop": "large enough" if len(seen) == 2 else None}
+
+    ran, seen = [], []
+    first = made()
+    first.train()
+    assert (ran, first.phases.finished) == ([2], True)
+    second = made()
+    assert second.resume()
+    second.train()
+    assert second.collected_frames == 2 * FRAMES
+    assert (ran, seen, second.phases.finished) == ([2], [FRAMES, 2 * FRAMES], True)
 
 
 def test_figures_go_to_the_logger(tmp_path: Path) -> None:

@@ -291,12 +291,12 @@ class EveryHook(_Hook):
     rule, a total loss of zero, is never met.
     """
 
-    name, stages, kept = "every", {"post_steps_log": "__call__"}, ("count",)
+    name, stages, kept = "every", {"post_steps_log": "__call__"}, ("count", "stopped")
 
     def __init__(self, trainer: Any, call: Callable[[Any], Mapping[str, Any]], *, every: int = 1) -> None:
         if every < 1:
             raise ConfigError(f"expected every >= 1 batches, received {every}")
-        self.trainer, self.call, self.every, self.count = trainer, call, every, 0
+        self.trainer, self.call, self.every, self.count, self.stopped = trainer, call, every, 0, ""
 
     def __call__(self, batch: TensorDictBase | None) -> dict[str, Any] | None:
         """Counts, and runs when it is time."""
@@ -308,5 +308,12 @@ class EveryHook(_Hook):
             result = dict(self.call(self.trainer))
         reason = result.pop("stop", None)
         if reason is not None:
-            self.trainer.request_stop(str(reason))
+            self.stopped = str(reason)
+            self.trainer.request_stop(self.stopped)
         return {**result, "log_pbar": False} if result else None
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Restores what ``state_dict`` returned; a training that was ended stays so."""
+        super().load_state_dict({"stopped": "", **state_dict})  # which checkpoints of earlier versions do not hold
+        if self.stopped:
+            self.trainer.request_stop(self.stopped)

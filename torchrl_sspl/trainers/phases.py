@@ -515,6 +515,7 @@ class Phases(TrainerHookBase):
     def register(self, trainer: Trainer, name: str = "phases") -> None:
         self.trainer = trainer
         trainer.register_op("post_steps", self)
+        trainer.register_op("post_steps_log", lambda batch: self())  # of a training that ended in this very stage, before its collector ends
         trainer.register_module(name, self)
 
 

@@ -324,7 +324,7 @@ class FineTune(_Training):
         change = ActionChangeLoss(work.dynamics, work.policy, action_scale=work.action_scale)
         # What the sets hold counts more than its share of the data; S may be empty.
         shares = ((unsafe, s.batch // 2), (unsafe[nearest], s.batch // 2), (safe, s.batch // 4))
-        pick = work.loop.pick
+        pick, acting = work.loop.pick, work.acting
 
         def step() -> TensorDict:
             drawn = [pick(len(table), s.batch)]
@@ -332,7 +332,7 @@ class FineTune(_Training):
             asked = rim[pick(len(rim), 3 * s.batch // 2)]
             if s.tolerated_error > 0:  # the worst of them
                 with torch.no_grad():
-                    after = work.dynamics(asked["latent"], work.policy(asked["latent"]))
+                    after = work.dynamics(asked["latent"], acting(asked["latent"]))
                 error = worst_error(work.barrier, after, s.tolerated_error)
             else:
                 error = asked["residual"][torch.arange(len(asked)), pick(s.residuals, len(asked))]

@@ -247,7 +247,8 @@ class SSPLTrainer(Trainer):
         try:
             if self.optimization_stepper.inside:
                 self._finish_batch()
-            if self.collected_frames < self.total_frames and not self._stop_training:
+            begun = self.phases is not None and self.phases.begun
+            if self.collected_frames < self.total_frames and not self._stop_training and not begun:
                 super().train()
             else:
                 if self.phases is not None and not self.phases.finished:
