@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchrl_sspl.errors import ConfigError, EmptyRegionError, NonFiniteError, OverlapError, ShapeError
+from torchrl_sspl.evaluation.known import states_where
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE, Box, Difference, Mixture, Region, Union, check_disjoint, label
 
 quick = settings(max_examples=40, deadline=None, derandomize=True)
@@ -225,3 +226,14 @@ def test_a_union_has_the_box_around_its_parts():
     both = Box([0.0, -1.0], [1.0, 0.0]) | Box([2.0, -3.0], [3.0, -2.0])
     assert both.low.tolist() == [0.0, -3.0]
     assert both.high.tolist() == [3.0, 0.0]
+
+
+def test_the_first_of_many_samples_are_samples_whatever_a_union_groups():
+    left, right = Box([0.0], [1.0]), Box([2.0], [3.0])
+    for region in (left | right, Mixture([left, right], [0.5, 0.5])):
+        found = (region - Box([0.9], [1.0])).sample(400, torch.Generator().manual_seed(0))
+        assert 0.4 < float(right.contains(found).float().mean()) < 0.6
+        found = states_where(lambda state: state[:, 0] < 9.0, region, 400, torch.Generator().manual_seed(0))
+        assert 0.4 < float(right.contains(found).float().mean()) < 0.6
+        grouped = right.contains(region.sample(400, torch.Generator().manual_seed(0)))
+        assert bool((grouped.int().diff() >= 0).all())

@@ -60,6 +60,10 @@ class Region:
         """
         raise NotImplementedError
 
+    def shuffled(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Samples as of :meth:`sample`, in such an order that the first of them are samples, too."""
+        return self.sample(n, generator, device)
+
     def __sub__(self, other: Region) -> Difference:
         return Difference(self, other)
 
@@ -153,7 +157,7 @@ class Difference(Region):
         """Samples of A without those in B; raises EmptyRegionError if (almost) every sample of A is in B."""
         parts, found = [], 0
         for _ in range(_ATTEMPTS):
-            x = self.a.sample(max(2 * n, 64), generator, device)
+            x = self.a.shuffled(max(2 * n, 64), generator, device)
             x = x[~self.b.contains(x)]
             parts.append(x)
             found += len(x)
@@ -195,8 +199,13 @@ class Union(Region):
         return torch.stack([p.contains(state) for p in self.parts]).any(0)
 
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
-        """Samples in equal shares from the parts, grouped by part."""
+        """Samples in equal shares from the parts, whatever their size, grouped by part: uniform where these are as large and apart."""
         return self._by_part(torch.randint(len(self.parts), (n,), generator=generator, device=device), generator, device)
+
+    def shuffled(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
+        """Samples as of :meth:`sample`, not grouped."""
+        found = self.sample(n, generator, device)
+        return found[torch.randperm(n, generator=generator, device=device)]
 
     def _by_part(self, which: Tensor, generator: torch.Generator | None, device: torch.device | str | None) -> Tensor:
         return torch.cat([p.sample(int((which == k).sum()), generator, device) for k, p in enumerate(self.parts)])

@@ -216,7 +216,7 @@ class SafetyEnv(EnvBase):
     def sample_states(
         self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None
     ) -> Tensor:
-        """States ``(n, state_dim)``, uniform in a region (``initial_set``), by a generator (the environment's)."""
+        """States ``(n, state_dim)``, as a region samples them (``initial_set``), uniformly but for unions and mixtures, by a generator (the environment's)."""
         chosen = self.initial_set if region is None else region
         generator = generator or self._generator
         return chosen.sample(n, generator=generator, device=generator.device).to(self.device)

@@ -92,7 +92,7 @@ def states_where(
     kept: list[Tensor] = []
     found = 0
     for drawn in range(1, draws + 1):
-        state = space.sample(max(n, 2000), generator=generator)
+        state = space.shuffled(max(n, 2000), generator=generator)
         state = state[keep(state)]
         kept.append(state)
         found += len(state)
