@@ -16,6 +16,8 @@ import torchrl_sspl
 from torchrl_sspl import cli
 from torchrl_sspl.configs import compose
 from torchrl_sspl.configs.reader import ENVS, fields, from_dict
+from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.modules.agent import load
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
 #: A run of a few seconds, on top of preset=smoke.
@@ -331,3 +333,16 @@ def test_export_writes_the_file(tmp_path, capsys):
     assert cli.main(["export", "pendulum", str(tmp_path / "agent.pt2")]) == 0
     assert capsys.readouterr().out.strip().endswith("agent.pt2")
     assert (tmp_path / "agent.pt2").stat().st_size > 1000
+
+
+@pytest.mark.parametrize("word", ["walks=200", "evaluation.renderer_episodes=3", "calibrate=false"])
+def test_options_of_a_run_are_refused_where_they_would_do_nothing(word):
+    with pytest.raises(ConfigError, match="belong to a run"):
+        cli.evaluate_agent("pendulum", [word])
+
+
+def test_an_evaluation_keeps_away_from_the_seed_of_the_training():
+    with pytest.raises(ConfigError, match="with which the data of the training are drawn"):
+        cli.evaluate_agent("pendulum", [f"seed={load('pendulum').description['config']['seed']}"])
+    with pytest.raises(ConfigError, match=r"evaluation\.seed to be another one than seed=5"):
+        compose(["env=pendulum", "seed=5", "evaluation.seed=5"]).check()

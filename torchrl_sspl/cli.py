@@ -182,10 +182,14 @@ def _evaluate(words: list[str]) -> int:
     return 0
 
 
+#: Options of the evaluation at the end of a run.
+_OF_A_RUN = ("walks", "walk_seconds", "walk_seed", "renderer_episodes", "certificate_episodes", "certificate_seconds", "calibrate")
+
+
 def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: str = "cpu") -> Any:
     """Measurements of a shipped agent or the agent of a run directory on its own environment.
 
-    Overrides are ``key=value`` for the fields of ``EvaluationConfig``. Raises CheckpointError if there is no such
+    Overrides are ``key=value`` for the fields of ``EvaluationConfig`` but those of walks, other renderers, level and certificate. Raises CheckpointError if there is no such
     agent, or its environment is not known; ConfigError if a key or a value is not valid. Source: none.
     """
     from torchrl_sspl.configs.reader import EnvFactory, change, from_dict
@@ -194,6 +198,13 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
     from torchrl_sspl.evaluation.known import evaluate as evaluate_known
     from torchrl_sspl.modules.agent import load
 
+    for word in overrides:
+        key = word.partition("=")[0].removeprefix("evaluation.")
+        if key in _OF_A_RUN:
+            raise ConfigError(
+                f"expected options of what is measured here, received '{key}': walks, other renderers, level and certificate belong to a run; "
+                "an example measures them, too: make quadruped ARGS='agent=quadruped evaluation.walks=20'"
+            )
     agent = load(name_or_path, device)
     trained = agent.description.get("config", {})
     if "env" in trained and "_target_" not in trained["env"]:

@@ -379,6 +379,8 @@ class Config:
                 f"expected augmentation.share > 0 with synthesis.steady_steps={self.synthesis.steady_steps}, received {self.augmentation.share}: "
                 "there is nothing to be steady under; synthesis.steady_steps=0 leaves the encoder as it is"
             )
+        if self.evaluation.seed == self.seed:
+            raise ConfigError(f"expected evaluation.seed to be another one than seed={self.seed}, with which the data of the training are drawn; choose a fresh one")
         self._check_labels()
         if self.synthesis.rounds < 1:
             raise ConfigError(f"expected synthesis.rounds >= 1, received {self.synthesis.rounds}; synthesis.enabled=false for none")
