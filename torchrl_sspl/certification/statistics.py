@@ -25,7 +25,8 @@ def clopper_pearson(events: int, n: int, *, confidence: float = 0.95) -> tuple[f
     .. math:: \left[ \operatorname{Beta}^{-1}(a; k, n - k + 1), \operatorname{Beta}^{-1}(1 - a; k + 1, n - k) \right]
 
     with :math:`a = (1 - c) / 2`, or :math:`a = 1 - c` on the one side that is left when no (or every) trial was an
-    event: 0 of 3000 gives an upper bound of 0.1 % at 95 %.
+    event: 0 of 3000 gives an upper bound of 0.1 % at 95 %. Read either bound by itself: it holds with confidence c at
+    least. Both at once may hold with less, since what is found decides on a.
 
     Args:
         events: k, number of events, 0 <= k <= n, else ``ConfigError``.
