@@ -41,6 +41,20 @@ def test_start_is_where_it_was_asked_for_and_frames_agree_with_the_model(env):
     assert not any(info[name] for name in ("unsafe", "contact", "fallen", "left"))
 
 
+def test_an_arena_of_another_size_is_seen_as_the_model_draws_it():
+    model = DubinsEnv(arena_half_size=3.0, safe_half_size=2.2, image_size=64)
+    world_ = model.physics()(render_mode="rgb_array")
+    pixels, info = world_.reset(options={"pose": [2.7, -2.6, 0.7], "phase": 0.0})
+    drawn = model.observe(torch.as_tensor(info["pose"], dtype=torch.float32)[None])[0, 3:].numpy()
+    large = world_.render()
+    world_.close()
+    for red in (lambda f: (f[0] > 150) & (f[1] < 100), lambda f: (f[2] > 150) & (f[1] < 100)):  # the obstacle, the robot
+        (there, here, shown) = (np.argwhere(red(f.astype(int))) for f in (pixels[3:], drawn, large.transpose(2, 0, 1)))
+        np.testing.assert_allclose(there.mean(0), here.mean(0), atol=1.0)
+        np.testing.assert_allclose(shown.mean(0) / 8, here.mean(0), atol=1.0)
+        assert len(there) == pytest.approx(len(here), rel=0.2, abs=3)
+
+
 def test_walks_a_metre_a_second_and_turns_as_told(env):
     _, info = env.reset(options={"pose": [-1.5, -1.7, 0.0], "phase": 0.3})
     first = info["pose"]
@@ -143,6 +157,10 @@ def test_bad_parameters_are_named():
     for arguments, words in (
         ({"max_yaw_rate": math.nan}, "max_yaw_rate"),
         ({"obstacle_half_size": 0.9}, "obstacle <= unsafe"),
+        ({"arena_half_size": 1.0}, "safe < arena"),  # no start would ever be found
+        ({"obstacle_centre": [math.nan, 0.0]}, "obstacle_centre"),
+        ({"obstacle_centre": [0.0]}, "obstacle_centre"),
+        ({"obstacle_centre": [9.0, 0.0]}, "obstacle_centre"),
         ({"render_mode": "film"}, "render_mode"),
         ({"obstacle_shape": "star"}, "obstacle_shape"),
     ):

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor, wrapped
+from torchrl_sspl.envs.quadruped.arena import check_arena, half_view
 from torchrl_sspl.envs.quadruped.compositor import TopViewCompositor
 from torchrl_sspl.envs.system import Opening, Requirement, System
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.sets import SAFE, Box, Region
 
-_SHAPES = ("square", "disc")
 YAW_LAG = (0.048, 0.063)
 """Turn of the walking robot in one step per yaw rate commanded now and one step before, in s."""
 _REQUIREMENTS = (
@@ -180,20 +180,11 @@ class DubinsEnv(SafetyEnv):
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
-        if obstacle_shape not in _SHAPES:
-            raise ConfigError(f"obstacle_shape: expected one of {list(_SHAPES)}, received {obstacle_shape!r}.")
-        check_positive(
-            max_yaw_rate=max_yaw_rate, speed=speed, dt=dt, arena_half_size=arena_half_size,
-            safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size, obstacle_half_size=obstacle_half_size,
+        check_positive(max_yaw_rate=max_yaw_rate, speed=speed, dt=dt)
+        centre = check_arena(
+            arena_half_size=arena_half_size, safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size,
+            obstacle_shape=obstacle_shape, obstacle_half_size=obstacle_half_size, obstacle_centre=obstacle_centre,
         )  # fmt: skip
-        centre = [float(v) for v in obstacle_centre]
-        if len(centre) != 2 or not all(abs(v) <= arena_half_size for v in centre):
-            raise ConfigError(f"obstacle_centre: expected (x, y) inside the arena, received {list(obstacle_centre)}.")
-        if not obstacle_half_size <= unsafe_half_size < safe_half_size < arena_half_size + max(map(abs, centre)):
-            raise ConfigError(
-                "sizes: expected obstacle <= unsafe < safe < arena, received "
-                f"{obstacle_half_size}, {unsafe_half_size}, {safe_half_size}, {arena_half_size}."
-            )
         if yaw_lag is not None and (len(yaw_lag) != 2 or not all(math.isfinite(v) for v in yaw_lag)):
             raise ConfigError(f"yaw_lag: expected two finite numbers (a, b) in s or None, received {yaw_lag!r}.")
         turn = 2 * math.pi
@@ -217,10 +208,10 @@ class DubinsEnv(SafetyEnv):
         self.max_yaw_rate, self.speed, self.dt = float(max_yaw_rate), float(speed), float(dt)
         self.yaw_lag = None if yaw_lag is None else (float(yaw_lag[0]), float(yaw_lag[1]))
         self.obstacle_shape, self.obstacle_half_size = obstacle_shape, float(obstacle_half_size)
-        self.obstacle_centre, self.arena_half_size = (centre[0], centre[1]), float(arena_half_size)
+        self.obstacle_centre, self.arena_half_size = centre, float(arena_half_size)
         self.safe_half_size, self.unsafe_half_size = float(safe_half_size), float(unsafe_half_size)
         self.obstacle = obstacle  # what stands on the ground, a set of (x, y)
-        self.half_view = 1.2 * self.arena_half_size  # robots a little outside the arena are still seen
+        self.half_view = half_view(self.arena_half_size)
         self._compositor = TopViewCompositor(image_size, obstacle=obstacle, half_view=self.half_view, device=self.device)
 
     @property

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchrl_sspl.envs.base import check_positive
+from torchrl_sspl.envs.quadruped.arena import check_arena, half_view
 from torchrl_sspl.envs.quadruped.camera import TopCamera
 from torchrl_sspl.envs.quadruped.controller import Measurement
 from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
@@ -77,16 +78,11 @@ class QuadrupedEnv(gymnasium.Env):
         meshes: bool = False,
         render_mode: str | None = None,
     ) -> None:
-        check_positive(
-            max_yaw_rate=max_yaw_rate, speed=speed, dt=dt, arena_half_size=arena_half_size,
-            safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size, obstacle_half_size=obstacle_half_size,
-            friction=friction,
+        check_positive(max_yaw_rate=max_yaw_rate, speed=speed, dt=dt, friction=friction)
+        centre = check_arena(
+            arena_half_size=arena_half_size, safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size,
+            obstacle_shape=obstacle_shape, obstacle_half_size=obstacle_half_size, obstacle_centre=obstacle_centre,
         )  # fmt: skip
-        if not obstacle_half_size <= unsafe_half_size < safe_half_size:
-            raise ConfigError(
-                "sizes: expected obstacle <= unsafe < safe, received "
-                f"{obstacle_half_size}, {unsafe_half_size}, {safe_half_size}."
-            )
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ConfigError(
                 f"render_mode: expected None or one of {self.metadata['render_modes']}, received {render_mode!r}."
@@ -94,7 +90,7 @@ class QuadrupedEnv(gymnasium.Env):
         self.max_yaw_rate, self.speed, self.dt = float(max_yaw_rate), float(speed), float(dt)
         self.arena_half_size = arena_half_size
         self.safe_half_size, self.unsafe_half_size = safe_half_size, unsafe_half_size
-        self.obstacle_shape, self.obstacle_centre = obstacle_shape, np.asarray(obstacle_centre, dtype=np.float64)
+        self.obstacle_shape, self.obstacle_centre = obstacle_shape, np.asarray(centre, dtype=np.float64)
         self.obstacle_half_size = obstacle_half_size
         self.render_mode = render_mode
         self._client = connect(gui=render_mode == "human")
@@ -103,8 +99,9 @@ class QuadrupedEnv(gymnasium.Env):
             QuadrupedEnv._gait = self._robot.steady_gait()
         self._client.changeDynamics(self._robot.ground, -1, lateralFriction=friction)
         self._obstacle = add_obstacle(self._client, obstacle_shape, obstacle_half_size, self.obstacle_centre.tolist())
-        self._camera = TopCamera(self._client, image_size)
-        self._large = TopCamera(self._client, _RENDER_SIZE)
+        view = half_view(arena_half_size)
+        self._camera = TopCamera(self._client, image_size, half_view=view)
+        self._large = TopCamera(self._client, _RENDER_SIZE, half_view=view)
         self._substeps = max(1, round(dt / self._robot.dt))
         self._frames: NDArray[np.uint8] | None = None
         self._push = 0.0  # N, of the step that follows

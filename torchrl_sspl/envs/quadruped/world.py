@@ -14,6 +14,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from torchrl_sspl.envs.quadruped.arena import check_shape
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 
 # In m: tall enough to be hit by legs and body, low enough that the back of a robot is always seen from above.
@@ -24,7 +25,6 @@ _LEG_COLOUR = (0.20, 0.20, 0.22, 1.0)
 _HEAD_COLOUR = (1.0, 0.85, 0.0, 1.0)
 _HEAD_PLATE = {"xyz": "0.2 0 0.06", "size": "0.14 0.24 0.02"}
 GROUND_FRICTION, _TOE_FRICTION = 0.9, 1.0  # coefficients; those of two bodies that touch are multiplied
-_SHAPES = ("square", "disc")
 
 
 def import_pybullet() -> tuple[ModuleType, str]:
@@ -77,8 +77,7 @@ def add_obstacle(client: Any, shape: str, half_size: float, centre: Sequence[flo
 
     Raises ConfigError for another shape.
     """
-    if shape not in _SHAPES:
-        raise ConfigError(f"obstacle_shape: expected one of {list(_SHAPES)}, received {shape!r}.")
+    check_shape(shape)
     if shape == "square":
         kind: int = client.GEOM_BOX
         size: dict[str, Any] = {"halfExtents": [half_size, half_size, OBSTACLE_HEIGHT / 2]}
