@@ -68,6 +68,14 @@ def test_walks_a_metre_a_second_and_turns_as_told(env):
     assert info["pose"][2] - heading == pytest.approx(1.0, abs=0.15)
 
 
+def test_at_another_speed_it_starts_in_the_gait_of_that_speed():
+    slow = QuadrupedEnv(speed=0.5, image_size=16)
+    _, info = slow.reset(options={"pose": [-1.8, 0.0, 0.0], "phase": 0.0})
+    places = [info["pose"][0], *(slow.step(np.array([0.0]))[4]["pose"][0] for _ in range(2))]
+    slow.close()
+    np.testing.assert_allclose(places, [-1.8, -1.75, -1.7], atol=0.01)
+
+
 def test_touching_the_obstacle_is_seen_and_costs(env):
     env.reset(options={"pose": [-1.1, 0.0, 0.0]})
     for _ in range(8):

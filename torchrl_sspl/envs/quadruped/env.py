@@ -59,7 +59,7 @@ class QuadrupedEnv(gymnasium.Env):
     """
 
     metadata: ClassVar = {"render_modes": ["human", "rgb_array"], "render_fps": 10}  # type: ignore[misc]
-    _gait: ClassVar[list[Snapshot]] = []
+    _gaits: ClassVar[dict[float, list[Snapshot]]] = {}
 
     def __init__(
         self,
@@ -95,8 +95,9 @@ class QuadrupedEnv(gymnasium.Env):
         self.render_mode = render_mode
         self._client = connect(gui=render_mode == "human")
         self._robot = WalkingRobot(self._client, meshes=meshes)
-        if not QuadrupedEnv._gait:  # the same for every robot of the process; two seconds of simulation
-            QuadrupedEnv._gait = self._robot.steady_gait()
+        if self.speed not in self._gaits:  # the same for every robot of the process; two seconds of simulation
+            self._gaits[self.speed] = self._robot.steady_gait(speed=self.speed)
+        self._gait = self._gaits[self.speed]
         self._client.changeDynamics(self._robot.ground, -1, lateralFriction=friction)
         self._obstacle = add_obstacle(self._client, obstacle_shape, obstacle_half_size, self.obstacle_centre.tolist())
         view = half_view(arena_half_size)

@@ -24,7 +24,6 @@ from torchrl_sspl.envs.quadruped.world import add_ground, add_robot
 
 _FALLEN_HEIGHT, _FALLEN_TILT = 0.15, 0.8  # m, rad
 _SETTLING_PERIODS = 8
-_STRAIGHT = np.array([1.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True)
@@ -107,20 +106,20 @@ class WalkingRobot:
         self.pose_as(Measurement(position, rotation, velocity, angular, then.joints, then.joint_velocities))
         self.controller.reset(self.measured, snapshot.memory.moved(angle, shift))
 
-    def steady_gait(self, interval: int = 5) -> list[Snapshot]:
-        """One period of walking straight ahead at 1 m/s, after 2.9 s in which the gait settles.
+    def steady_gait(self, interval: int = 5, *, speed: float = 1.0) -> list[Snapshot]:
+        """One period of walking straight ahead at a speed in m/s, after 2.9 s in which the gait settles.
 
         Snapshots are ``interval`` time steps apart, at phases 0, interval dt / period, ... of the gait.
         """
         self.stand()
-        period = round(PERIOD / self.dt)
+        period, straight = round(PERIOD / self.dt), np.array([speed, 0.0, 0.0])
         for _ in range(_SETTLING_PERIODS * period):
-            self.step(_STRAIGHT)
+            self.step(straight)
         snapshots = []
         for k in range(period):
             if k % interval == 0:
                 snapshots.append(Snapshot(self.measured, self.controller.memory))
-            self.step(_STRAIGHT)
+            self.step(straight)
         return snapshots
 
     def _set_standing(self, x: float = 0.0, y: float = 0.0, heading: float = 0.0, centre: float = 0.0) -> None:
