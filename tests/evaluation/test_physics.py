@@ -11,18 +11,19 @@ from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.envs.dubins import YAW_LAG
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.physics import evaluate_physics
+from torchrl_sspl.evaluation.simulation import simulate
 
 
 class Car(DubinsEnv):
     """The Dubins car whose full physics are a stand-in, with faults that a test asks for."""
 
-    def __init__(self, faults=None, **options):
+    def __init__(self, faults=None, world=World, **options):
         super().__init__(batch_size=[1], image_size=64, seed=0, **options)
-        self.worlds, self.faults = [], faults or {}
+        self.worlds, self.faults, self.world = [], faults or {}, world
 
     def physics(self):
         def make():
-            self.worlds.append(World(**self.faults))
+            self.worlds.append(self.world(**self.faults))
             return self.worlds[-1]
 
         return make
@@ -91,6 +92,60 @@ def test_the_closest_call_is_filmed():
     assert walks.frames.shape[:2] == (4, 1)
     starts = torch.cat([g.states[0] for g in groups])
     assert sorted(walks.states[0].tolist()) == sorted(starts.tolist())
+
+
+class Moving(World):
+    """As the robot in full physics: a reset takes a step of its own, and how it goes depends on the seed."""
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed, options=options)
+        observation, _, _, _, info = self.step(torch.tensor([0.1 * (seed % 7)]))
+        return observation, info
+
+
+class Circling:
+    """Turns all the time; its barrier is one of the distance from the middle."""
+
+    reads = "state"
+
+    def __init__(self, barrier):
+        self.barrier = barrier
+
+    def act(self, state):
+        return torch.full((len(state), 1), 0.7), self.barrier(state[:, :2].abs().amax(-1))
+
+
+@pytest.mark.parametrize(("barrier", "from_safe"), [(lambda far: 1.2 - far, False), (lambda far: far - 3.0, True)])
+def test_the_film_shows_the_very_walk_that_was_measured(barrier, from_safe):
+    env, policy = Car(world=Moving), Circling(barrier)
+    found, groups = evaluate_physics(policy, env, sizes(4, 0.5))
+    walks, every = found.arrays["walks"], groups[0].joined(groups[1])
+    chosen = int(torch.where(every.alive, every.barrier, -torch.inf).amax(0).argmax())
+    assert (chosen < 4) == from_safe
+    order = [chosen, *(k for k in range(len(every)) if k != chosen)]
+    assert torch.equal(walks.states, every.states[:, order])
+    assert torch.equal(walks.alive, every.alive[:, order])
+    assert all(torch.equal(happened, every.events[name][order]) for name, happened in walks.events.items())
+    steps = int(walks.alive[:, 0].sum())
+    assert torch.equal(walks.frames[:steps, 0], env.draw(walks.states[:steps, 0]))
+    start, seed = found.arrays["closest"]
+    again = simulate(policy, Moving(), start=torch.tensor([start]), horizon=5, seed=seed)
+    assert torch.equal(again.states[:, 0], every.states[:, chosen])
+
+
+@pytest.mark.pybullet
+def test_in_full_physics_a_walk_is_repeated_bit_for_bit():
+    pytest.importorskip("pybullet")
+    env, policy = DubinsEnv(image_size=64), Circling(lambda far: 1.2 - far)
+    found, groups = evaluate_physics(policy, env, sizes(2, 0.5))
+    start, seed = found.arrays["closest"]
+    world = env.physics()()
+    again = simulate(policy, world, start=torch.tensor([start]), horizon=5, seed=seed, film=1)
+    world.close()
+    walks = found.arrays["walks"]
+    assert torch.equal(again.states[:, 0], walks.states[:, 0])
+    assert torch.equal(again.frames, walks.frames)
+    assert any(torch.equal(again.states[:, 0], group.states[:, k]) for group in groups for k in range(len(group)))
 
 
 def test_a_lagging_car_starts_walks_in_the_states_of_its_twin():

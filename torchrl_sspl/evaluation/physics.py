@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -33,7 +34,8 @@ def evaluate_physics(
 
     Returns:
         Measurements (shares of episodes with exact bounds; in ``arrays["walks"]`` all episodes, first the closest call,
-        with its frames; in ``arrays["closest"]`` its start and seed), and the episodes: those from S, then those from {B <= 0} where there are any.
+        with its frames; in ``arrays["closest"]`` the pose that it was asked to start at, and its seed), and the episodes: those from S,
+        then those from {B <= 0} where there are any.
 
     Raises:
         ConfigError: the system has no full physics.
@@ -54,7 +56,7 @@ def evaluate_physics(
                 label = f"walks from {where}" if progress else None
                 if len(start):
                     groups.append(simulate(acts, world, start=start, label=label, **options))
-            out.arrays["walks"], out.arrays["closest"] = _closest_on_film(acts, world, groups, options)
+            out.arrays["walks"], out.arrays["closest"] = _closest_on_film(acts, world, groups, starts, options)
         finally:
             world.close()
     length = f"walks of at most {config.walk_seconds:g} s from"
@@ -86,20 +88,21 @@ def _steps(env: SafetyEnv, config: EvaluationConfig) -> int:
 
 
 def _closest_on_film(
-    acts: Controller, world: Any, groups: list[Episodes], options: dict[str, Any]
+    acts: Controller, world: Any, groups: list[Episodes], starts: list[tuple[str, Tensor]], options: dict[str, Any]
 ) -> tuple[Episodes, tuple[list[float], int]]:
-    """All episodes; first the one whose barrier came highest (the very first without one), once more and filmed; its start and
-    seed."""
+    """All episodes as they were measured; first the one whose barrier came highest (the very first without one), walked once more
+    for its film; its start and seed."""
     every, lengths = groups[0].joined(*groups[1:]), [len(group) for group in groups]
     chosen = 0
     if every.barrier is not None:
         chosen = int(torch.where(every.alive, every.barrier, -torch.inf).amax(0).argmax())
     number = chosen if chosen < lengths[0] else chosen - lengths[0]  # each group counts its seeds anew
-    start = every.states[0, chosen][None]
+    # A reset takes a step of its own: the same walk begins at the pose that was asked for, not at the first state that was seen.
+    start = torch.cat([asked for _, asked in starts])[chosen][None]
     seed = options["seed"] + number
-    again = simulate(acts, world, start=start, film=1, **(options | {"seed": seed}))
-    rest = torch.arange(len(every)) != chosen
-    return again.joined(every.select(rest)) if bool(rest.any()) else again, (start[0].tolist(), seed)
+    film = simulate(acts, world, start=start, film=1, **(options | {"seed": seed})).frames
+    rest = [k for k in range(len(every)) if k != chosen]
+    return replace(every.select([chosen, *rest]), frames=film), (start[0].tolist(), seed)
 
 
 def _starts_inside(acts: Controller, twin: SafetyEnv, n: int, generator: torch.Generator) -> Tensor:
