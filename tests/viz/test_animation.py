@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import subprocess
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 import torch
 from PIL import Image
 
-from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.envs import CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.viz import Plane, Scene, Take, animate
+from torchrl_sspl.viz.animation import _Drawing
 
 
 @pytest.fixture
@@ -82,6 +84,19 @@ def test_the_zero_level_is_that_at_the_heading_of_the_robot(tmp_path, claimed):
     different = (shown[-1.0] != shown[1.0]).any(-1)
     columns = different[:, 400:].any(0).nonzero()[0] + 400
     assert columns.max() - columns.min() > 80  # the line has moved by 2 m of 4
+
+
+@pytest.mark.parametrize(("heading", "goal"), [(0.0, 0.0), (2.0, 0.3), (3.1, -0.6), (-3.1, 0.6), (0.5, 0.7)])  # the last beyond the grid
+def test_the_zero_level_is_that_of_all_coordinates_that_are_not_shown(heading, goal):
+    car = CMUTwoDiscsEnv(image_size=8)
+    plane, states = Plane.of(car, car.system.state_names[:2]), car.state_space.grid((21, 7, 121, 3))
+    level = states[:, 0] - 0.5 * states[:, 2].cos() - states[:, 3]
+    take = Take("policy", [np.zeros((8, 8, 3), np.uint8)], [("", "fair")], torch.tensor([[0.0, 0.0, heading, goal]]))
+    drawing = _Drawing(Scene("A", [take]), plane, (states, {"B": level}), "B", 1)
+    next(drawing.images())
+    assert "true state; line: B = 0 in its plane" in [axes.get_title() for axes in drawing.figure.axes]
+    (line,) = drawing.levels[0].lines.get_segments()
+    assert line[:, 0] == pytest.approx(0.5 * math.cos(heading) + min(goal, 0.6), abs=2e-3)
 
 
 def test_mp4_has_the_asked_for_length_and_size(env, tmp_path):

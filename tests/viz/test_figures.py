@@ -83,6 +83,18 @@ def test_other_coordinates_are_reduced_to_the_worst_or_fixed():
     np.testing.assert_allclose(cut["b"][0], x)
 
 
+def test_captions_say_at_which_values_of_the_other_coordinates_a_line_holds(plane, grid, disk):
+    states = Box([-1.0] * 3, [1.0] * 3).grid([5, 4, 3])
+    solid, value = Plane(("x", "y"), [-1] * 3, [1] * 3), states.norm(dim=-1) - 1.2
+    cut = Plane(("x", "y"), [-1] * 3, [1] * 3, fixed={2: 0.0})
+    assert "at every value of the coordinates that are not shown" in state_plane(solid, states, value).get_label()
+    assert "at some values of the coordinates that are not shown" in state_plane(solid, states, value, reduce="min").get_label()
+    paths = torch.zeros(3, 1, 3), torch.zeros(2, 1, 1)
+    assert "at every value" in trajectories(solid, *paths, background=(states, value)).get_label()
+    for figure in (state_plane(plane, grid, disk), state_plane(cut, states, value), trajectories(solid, *paths)):
+        assert "not shown" not in figure.get_label()
+
+
 def test_swapped_coordinates_swap_the_axes(grid):
     swapped = Plane(("y", "x"), [-2, -2], [2, 2], coords=(1, 0))
     _, _, table = swapped.grid(grid, {"b": grid[:, 0]})

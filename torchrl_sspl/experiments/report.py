@@ -249,6 +249,8 @@ def _film(outcome: Outcome, env: SafetyEnv | None, folder: Path) -> tuple[Path |
     finally:
         film.close()
     caption = _CAPTION.format("in full physics" if closest is not None else "on the true dynamics")
+    if twin.state_dim > 2:
+        caption += " Coordinates that the plane does not show are those of the moment."
     return path, caption + (" The dashed line is the border of the true kernel." if levels and "kernel" in levels[1] else "")
 
 

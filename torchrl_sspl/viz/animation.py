@@ -22,6 +22,7 @@ from torchrl_sspl.viz.plane import (
     SAFE_FILL,
     Plane,
     array,
+    full_grid,
     new_figure,
     require,
 )  # fmt: skip
@@ -76,8 +77,8 @@ def animate(
         scenes: what is shown.
         path: the file to write, ``.mp4`` or ``.gif``.
         plane: the coordinates shown, with S, U and the obstacle; None: no plane.
-        levels: grid states ``(n, dim)`` and, by name, values ``(n,)`` of which the zero level is drawn: ``"B"``, ``"kernel"``. Of
-            three coordinates the third is that of the agent at the moment.
+        levels: grid states ``(n, dim)`` and, by name, values ``(n,)`` of which the zero level is drawn: ``"B"``, ``"kernel"``.
+            Coordinates that the plane does not show are those of the agent at the moment.
         value_name: of the values over time, with unit.
         fps: pictures per second.
 
@@ -166,7 +167,8 @@ class _Drawing:
         turns = plane.dim >= 3 and math.isclose(plane.period[2], 2 * math.pi, rel_tol=1e-4)
         units = [name.partition("[")[2] for name in plane.names]
         self.headings = turns and bool(units[0]) and units[0] == units[1]
-        axes.set_title("true state; line: B = 0" + (" at this heading" if self.headings else ""), fontsize=10.5, pad=4)
+        where = "" if not plane.hidden else " at this heading" if self.headings and plane.dim == 3 else " in its plane"
+        axes.set_title(f"true state; line: B = 0{where}", fontsize=10.5, pad=4)
         self.tracks = []
         for colour in self._colours():
             (track,) = axes.plot([], [], color=colour, linewidth=1.8)
@@ -254,19 +256,15 @@ class _Drawing:
 
 
 class _Level:
-    """The zero level of values on a grid, at the present value of a third coordinate."""
+    """The zero level of values on a grid, at the present values of the coordinates that are not shown."""
 
     def __init__(self, plane: Plane, states: Any, name: str, values: Any) -> None:
         self.colour, self.style = (BARRIER_COLOUR, "-") if name == "B" else (KERNEL_COLOUR, "--")
         self.lines: Any = None
-        self.period = plane.period[2] if plane.dim == 3 else 0.0
-        self.third = np.unique(array("states", states, (None, plane.dim))[:, 2]) if plane.dim == 3 else np.zeros(1)
-        self.tables = []
-        for value in self.third:
-            cut = dataclasses.replace(plane, fixed={2: float(value)}) if plane.dim == 3 else plane
-            self.x, self.y, table = cut.grid(states, {"v": values})
-            self.tables.append(table["v"].astype(float))
-        self.level = 0.5 if table["v"].dtype == bool else 0.0
+        self.plane = plane
+        self.axes, tables = full_grid(states, {"v": values}, plane.dim)
+        self.level = 0.5 if tables["v"].dtype == bool else 0.0
+        self.table = tables["v"].astype(float)
 
     def collection(self) -> Any:
         """The line, still empty."""
@@ -274,18 +272,23 @@ class _Level:
         return lines([], colors=self.colour, linewidths=1.5, linestyles=self.style, zorder=2)
 
     def turn_to(self, state: np.ndarray) -> None:
-        """Move the line to the third coordinate of a state."""
-        table = self.tables[0]
-        if len(self.third) > 1:
-            at = float(state[2])
-            if self.period:
-                at = self.third[0] + (at - self.third[0]) % self.period
-            k = int(np.searchsorted(self.third, at, side="right")) - 1
-            following = self.third[k + 1] if k + 1 < len(self.third) else self.third[0] + self.period
-            share = (at - self.third[k]) / max(following - self.third[k], 1e-9)
-            table = self.tables[k] + min(share, 1.0) * (self.tables[(k + 1) % len(self.tables)] - self.tables[k])
-        contours = require("contourpy").contour_generator(self.x, self.y, table)
+        """Move the line to the plane through a state."""
+        table = self.table
+        for axis in reversed(self.plane.hidden):
+            table = _between(self.axes[axis], table, axis, float(state[axis]), self.plane.period[axis])
+        x, y = (self.axes[k] for k in self.plane.coords)
+        contours = require("contourpy").contour_generator(x, y, self.plane.turned(table))
         self.lines.set_segments(contours.lines(self.level))
+
+
+def _between(nodes: np.ndarray, table: np.ndarray, axis: int, at: float, period: float) -> np.ndarray:
+    """A table at a value of one of its axes, linear between the nodes; beyond the last one constant, or periodic."""
+    first, last = nodes[0], nodes[-1]
+    at = first + (at - first) % period if period else min(max(at, first), last)
+    k = int(np.searchsorted(nodes, at, side="right")) - 1
+    here, there = table.take(k, axis), table.take((k + 1) % len(nodes), axis)
+    following = nodes[k + 1] if k + 1 < len(nodes) else first + period
+    return here + min((at - nodes[k]) / max(following - nodes[k], 1e-9), 1.0) * (there - here)
 
 
 def _checked(take: Take, plane: Plane | None) -> Take:

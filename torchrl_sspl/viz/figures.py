@@ -214,7 +214,7 @@ def state_plane(
     caption = (
         "Learned safe set {B \u2264 0} (inside the black line) in the state plane, with the labelled sets S (green) "
         "and U (red)" + (", and the border of the true viability kernel (blue)." if viable is not None else ".")
-    )
+    ) + plane.rest(reduce)
     figure = new_figure(6.6, 5.2, caption)
     ax = figure.add_subplot()
     plane.draw(ax)
@@ -293,7 +293,8 @@ def trajectories(
     chosen = _spread(x[0][:, list(plane.coords)] / extent, min(episodes, n))
     largest = action_scale or max(float(np.abs(u).max()), 1e-12)
     caption = (caption or f"{len(chosen)} trajectories of the learned policy").rstrip(".")
-    figure = new_figure(10.5, 5.0, f"{caption}; the longest arrow is {largest:.3g} ({action_name}).")
+    drawn = "" if background is None else plane.rest()
+    figure = new_figure(10.5, 5.0, f"{caption}; the longest arrow is {largest:.3g} ({action_name}).{drawn}")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
     ax = figure.add_subplot(grid[:, 0])
     handles = _draw_sets(ax, plane, x[:, chosen][..., list(plane.coords)].reshape(-1, 2), background)

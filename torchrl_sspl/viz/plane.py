@@ -140,6 +140,11 @@ class Plane:
         """Size of the state."""
         return len(self.low)
 
+    @property
+    def hidden(self) -> list[int]:
+        """The coordinates of the state that are not shown."""
+        return [k for k in range(self.dim) if k not in self.coords]
+
     def draw(self, ax: Axes, *, cover: np.ndarray | None = None, resolution: int = 480) -> None:
         """Axes with names and limits, and the sets S and U as areas; what lies outside the state space is grey.
 
@@ -209,36 +214,59 @@ class Plane:
         """
         if reduce not in ("max", "min"):
             raise ConfigError(f"reduce: expected 'max' or 'min', received {reduce!r}.")
-        x = array("states", states, (None, self.dim))
-        axes, index = zip(*(np.unique(x[:, k], return_inverse=True) for k in range(self.dim)), strict=True)
-        sizes = tuple(len(a) for a in axes)
-        flat = np.ravel_multi_index(index, sizes)
-        if math.prod(sizes) != len(x) or len(np.unique(flat)) != len(x):
-            raise ShapeError(
-                f"states: expected all nodes of a regular grid, received {len(x)} states with "
-                f"{' x '.join(map(str, sizes))} different coordinates; use state_space.grid(n)."
-            )
+        axes, tables = full_grid(states, values, self.dim)
         out = {}
-        for name, value in values.items():
-            column = torch.as_tensor(value)
-            v = array(name, column[:, 0] if column.ndim == 2 else column, (len(x),))
-            table = np.empty(sizes, v.dtype)
-            table.reshape(-1)[flat] = v
-            for k in reversed([k for k in range(self.dim) if k not in self.coords]):
+        for name, table in tables.items():
+            for k in reversed(self.hidden):
                 if k in self.fixed:
                     table = table.take(int(np.abs(axes[k] - self.fixed[k]).argmin()), axis=k)
                 else:
                     # For a bool, "in the set for all" is the smallest; for a barrier it is the largest value.
-                    largest = (reduce == "max") != (v.dtype == bool)
+                    largest = (reduce == "max") != (table.dtype == bool)
                     table = table.max(axis=k) if largest else table.min(axis=k)
-            out[name] = table.T if self.coords[0] < self.coords[1] else table
+            out[name] = self.turned(table)
         return axes[self.coords[0]], axes[self.coords[1]], out
+
+    def rest(self, reduce: str = "max") -> str:
+        """Words of a caption: for which values of coordinates not shown the lines of ``grid`` are; empty if none is reduced."""
+        if all(k in self.fixed for k in self.hidden):
+            return ""
+        values = "every value" if reduce == "max" else "some values"
+        return f" Lines are borders of what is in a set at {values} of the coordinates that are not shown."
+
+    def turned(self, table: np.ndarray) -> np.ndarray:
+        """A table of values over the two coordinates shown, in the order of the state, as a matrix ``(b, a)``."""
+        return table.T if self.coords[0] < self.coords[1] else table
 
     def unwrap_breaks(self, path: np.ndarray) -> np.ndarray:
         """Path ``(t, 2)`` in the plane with a row of NaN wherever a periodic coordinate jumps."""
         period = np.array([self.period[k] for k in self.coords])
         jump = ((np.abs(np.diff(path, axis=0)) > period / 2) & (period > 0)).any(1)
         return np.insert(path, np.nonzero(jump)[0] + 1, np.nan, axis=0)
+
+
+def full_grid(states: Any, values: dict[str, Any], dim: int) -> tuple[list[np.ndarray], dict[str, np.ndarray]]:
+    """The axes of a regular grid of states ``(n, dim)``, and values on it, ``(n,)`` or ``(n, 1)`` by name, as tables over all of them.
+
+    Raises ShapeError if the states are no full grid, or a value does not fit them.
+    """
+    x = array("states", states, (None, dim))
+    axes, index = zip(*(np.unique(x[:, k], return_inverse=True) for k in range(dim)), strict=True)
+    sizes = tuple(len(a) for a in axes)
+    flat = np.ravel_multi_index(index, sizes)
+    if math.prod(sizes) != len(x) or len(np.unique(flat)) != len(x):
+        raise ShapeError(
+            f"states: expected all nodes of a regular grid, received {len(x)} states with "
+            f"{' x '.join(map(str, sizes))} different coordinates; use state_space.grid(n)."
+        )
+    tables = {}
+    for name, value in values.items():
+        column = torch.as_tensor(value)
+        v = array(name, column[:, 0] if column.ndim == 2 else column, (len(x),))
+        table = np.empty(sizes, v.dtype)
+        table.reshape(-1)[flat] = v
+        tables[name] = table
+    return list(axes), tables
 
 
 def line_handle(colour: str, label: str, style: str = "-") -> Any:
