@@ -23,6 +23,7 @@ from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.modules.agent import load
 from torchrl_sspl.runtime import Monitor
+from torchrl_sspl.viz import live
 from torchrl_sspl.viz.live import watch
 from torchrl_sspl.viz.server import Feed
 
@@ -199,8 +200,25 @@ def test_the_quadruped_is_watched_in_full_physics():
     pytest.importorskip("pybullet")
     _, events, counts = seen("quadruped", env="physics", steps=3, protect=True)
     assert counts["steps"] == 3
+    _, again, _ = seen("quadruped", env="physics", steps=3, protect=True)
+    assert [(e["barrier"], e["taken"]) for e in again] == [(e["barrier"], e["taken"]) for e in events]  # the seed is the world's, too
     assert {e["verdict"] for e in events} == {"PROOF_APPLIES"}
     assert not any(e["unsafe"] for e in events)
+
+
+def test_every_episode_of_a_world_has_a_seed_of_its_own(monkeypatch):
+    seeds = []
+
+    def simulated(view, world, *, seed, **options):
+        seeds.append(seed)
+        if len(seeds) % 3 == 0:
+            raise live._Over
+
+    monkeypatch.setattr(live, "simulate", simulated)
+    for seed in (0, 0, 1):
+        live.watch("pendulum", port=0, seed=seed, ready=lambda address: None)
+    assert seeds[:3] == seeds[3:6]
+    assert len(set(seeds)) == 6
 
 
 def test_an_agent_without_a_proof_is_said_to_have_none(monkeypatch):

@@ -28,6 +28,7 @@ from torchrl_sspl.modules.agent import Agent
 from torchrl_sspl.runtime import CameraFault, Monitor, Shield, Verdict, Watched
 from torchrl_sspl.runtime.filter import UNPROVED_MARGIN
 from torchrl_sspl.runtime.monitor import starts
+from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import UNSAFE
 from torchrl_sspl.viz.animation import HEIGHT, WIDTH, mp4_writer
 from torchrl_sspl.viz.pages import render
@@ -197,7 +198,7 @@ def _of_system(agent: Agent, env: str | None, seed: int) -> tuple[Callable[[_Vie
         with closing(world) if env == PHYSICS else nullcontext():
             for k in itertools.count():
                 where: dict[str, Any] = {"episodes": 1} if begin is None else {"start": begin[k % len(begin)][None]}
-                simulate(view, world, horizon=_HORIZON - 1, watch=view.tell, **where)
+                simulate(view, world, horizon=_HORIZON - 1, seed=spawn(seed, "physics", k), watch=view.tell, **where)
 
     return run, 1.0 / float(getattr(made, "dt", 0.05))
 
