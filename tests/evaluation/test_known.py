@@ -143,6 +143,25 @@ def test_unsafe_states_have_a_grid_of_their_own_where_the_system_says_so():
     assert found["worst_unsafe_barrier"] == pytest.approx(0.4, abs=1e-6)
 
 
+def test_what_has_no_node_in_u_is_not_measured_rather_than_perfect():
+    between = pendulum()
+    between.unsafe_set = Box([1.0, 1.0], [1.15, 1.15])
+    found = evaluate(small_agent(), between, SMALL, kernel=kernel())
+    for name in ("unsafe_called_safe", "worst_unsafe_barrier"):
+        assert found[name] is None
+        assert found.measurements[name].note.endswith("of which none lies in U")
+    assert found["q2_with_margin"] is None
+    assert found["worst_safe_barrier"] is not None
+
+
+def test_without_episodes_it_is_said_that_none_were_asked_for():
+    found = evaluate(Rival(lambda x: x[:, 0].abs() - 1.2), pendulum(), SMALL, kernel=kernel(), episodes=0)
+    for name in ("safe_rollouts_touch_unsafe", "safe_rollouts_leave", "worst_next_barrier"):
+        assert found[name] is None
+        assert found.measurements[name].note == "no episodes were asked for"
+    assert found["volume_over_kernel"] > 0
+
+
 def test_grids_are_the_systems_own_or_in_its_proportions():
     class Coarse(PendulumEnv):
         @property

@@ -226,9 +226,13 @@ def _sets(run: _Run) -> Tensor | None:
     out.add(Measurement("barrier_depth", float(-barrier.min()), "barrier", note="|min B| on the grid"))
     out.arrays.update(barrier=barrier, **({} if latent is None else {"latent": latent}))
     in_unsafe, note = _unsafe_barrier(run, barrier[unsafe], on_grid)
+    note += "" if len(in_unsafe) else ", of which none lies in U"
     out.count("unsafe_called_safe", in_unsafe <= 0, note, independent=False)
-    worst = float(-in_unsafe.min())
-    out.add(Measurement("worst_unsafe_barrier", worst, "barrier", len(in_unsafe), note="q2: largest -B on U"))
+    if len(in_unsafe):
+        worst = float(-in_unsafe.min())
+        out.add(Measurement("worst_unsafe_barrier", worst, "barrier", len(in_unsafe), note="q2: largest -B on U"))
+    else:
+        out.missing("worst_unsafe_barrier", unit="barrier", note=note)
     return safe_barrier
 
 
@@ -298,7 +302,8 @@ def _from_the_set(run: _Run) -> None:
     start = states_where(run.inside, env.state_space, run.n, run.generator, draws=60 if "barrier" in out.arrays else 1)
     note = f"episodes of {horizon} steps from {{B<=0}}"
     if not len(start):
-        note = "{B<=0} is empty" if "barrier" in out.arrays else "no barrier"
+        note = "{B<=0} is empty" if run.n else "no episodes were asked for"
+        note = note if "barrier" in out.arrays else "no barrier"
         for name in ("safe_rollouts_touch_unsafe", "safe_rollouts_leave"):
             out.add(share(name, 0, 0, note))
         out.missing("worst_next_barrier", unit="barrier", note=note)
