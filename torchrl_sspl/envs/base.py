@@ -45,7 +45,7 @@ def check_positive(**values: float) -> None:
 
 
 def wrapped(angle: Tensor) -> Tensor:
-    """Angles in [-pi, pi), same shape."""
+    """Angles in [-pi, pi), up to the rounding of their type, same shape."""
     return torch.remainder(angle + math.pi, 2 * math.pi) - math.pi
 
 

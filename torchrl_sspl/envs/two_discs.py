@@ -40,8 +40,9 @@ class CMUTwoDiscsEnv(SafetyEnv):
 
     and the same of y with the sine, with v = 1 m/s and |u| <= 2 rad/s. X = [-1.5, 1.5]^2 x [-pi, pi] x [-0.6, 0.6]; U, the collisions, are
     the discs of radius 0.5 m around (0.25, 0.65) and (0.25, -0.65), with a gap of 0.3 m between them. Leaving X ends an episode, without a
-    collision, and counts as safe; S are the states whose next step leaves X, whatever is done. The goal lies at (1.3, g); it is drawn, stays
-    where it is, and has no part in what is safe. :meth:`reached` says whether a car is there.
+    collision, and counts as safe; S are the states whose next step straight ahead ends more than 2.5 mm outside X, by which a yaw rate can
+    bend it at most: some of those whose next step leaves X, whatever is done. The goal lies at (1.3, g); it is drawn, stays where it is,
+    and has no part in what is safe. :meth:`reached` says whether a car is there.
 
     The picture is theirs: filled discs, a dot for the goal and a comet for the car, drawn at four times the size and
     reduced by the Lanczos kernel in two passes, as Pillow does. They show their networks the heading as well; here there is only the
