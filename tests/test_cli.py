@@ -305,10 +305,19 @@ def test_gymnasium_and_an_encoder_by_import_paths(tmp_path, capsys, monkeypatch)
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize("seconds", ["nan", "-1"])
+def test_a_time_that_is_none_is_a_wrong_argument_of_verify(seconds, capsys):
+    assert cli.main(["verify", "pendulum", "--seconds", seconds]) == 2
+    assert "expected seconds >= 0" in capsys.readouterr().err
+
+
+QUICK = ["--episodes", "4", "--horizon", "3", "--pictures", "200", "--steps", "50"]
+
+
 def test_calibrate_writes_limits_that_the_monitor_reads(tmp_path, capsys):
     agent = torchrl_sspl.load("pendulum")
     agent.save(tmp_path / "run")
-    assert cli.main(["calibrate", str(tmp_path / "run"), "--episodes", "4", "--horizon", "3", "--pictures", "200", "--steps", "50"]) == 0
+    assert cli.main(["calibrate", str(tmp_path / "run"), *QUICK]) == 0
     shown = capsys.readouterr().out
     assert "innovation" in shown
     assert "100 % expected" in shown  # of four episodes
@@ -320,6 +329,7 @@ def test_calibrate_writes_limits_that_the_monitor_reads(tmp_path, capsys):
     [
         (["calibrate", "pendulum"], "--out DIRECTORY"),
         (["calibrate", "pendulum", "--out", "x", "--episodes", "0"], "episodes, horizon"),
+        (["calibrate", "pendulum", "--out", "x", *QUICK, "--noise", "inf"], "finite noise"),
         (["calibrate", "nobody"], "nobody"),
         (["export", "pendulum", "agent.bin"], ".onnx or .pt2"),
     ],

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Sequence
@@ -306,9 +307,9 @@ def _calibrate(words: list[str]) -> int:
     from torchrl_sspl.modules.agent import Agent, agent_directory
     from torchrl_sspl.runtime import calibrate
 
-    if min(given.episodes, given.horizon, given.pictures, given.steps) < 1 or not given.noise >= 0.0:
+    if min(given.episodes, given.horizon, given.pictures, given.steps) < 1 or not 0.0 <= given.noise < math.inf:
         raise ConfigError(
-            f"expected episodes, horizon, pictures and steps >= 1 and noise >= 0, received {given.episodes}, {given.horizon}, "
+            f"expected episodes, horizon, pictures and steps >= 1 and a finite noise >= 0, received {given.episodes}, {given.horizon}, "
             f"{given.pictures}, {given.steps} and {given.noise}"
         )
     directory = agent_directory(given.agent)

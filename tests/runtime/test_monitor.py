@@ -291,3 +291,11 @@ def test_every_fault_changes_what_is_shown_at_every_strength():
             assert differs or name == "dropped"  # two in a hundred frames
     with pytest.raises(ConfigError, match="faults"):
         CameraFault("rain", 1.0)
+
+
+@pytest.mark.parametrize("noise", [-1.0, math.inf, math.nan])
+def test_a_noise_that_no_camera_has_is_refused(noise):
+    with pytest.raises(ConfigError, match="finite noise"):
+        CameraFault("dark", 1.0, noise=noise)
+    with pytest.raises(ConfigError, match="finite noise"):
+        calibrate(None, None, noise=noise)  # before anything is fitted

@@ -400,12 +400,14 @@ def verify_run(
         measured again and none could be.
 
     Raises:
-        CheckpointError: if there is no such agent.
+        CheckpointError: if there is no such agent. ConfigError: for a time that is negative or NaN.
 
     Example:
         >>> verify_run("pendulum", measure=False, seconds=3600, report=lambda line: None)  # on a busy machine too
         0
     """
+    if not seconds >= 0.0:
+        raise ConfigError(f"expected seconds >= 0, received {seconds}")
     directory = agent_directory(name)
     try:
         with time_limit(math.inf if measure else seconds):

@@ -49,7 +49,7 @@ class CameraFault:
         noise: standard deviation of the camera's own noise, grey levels, from the first step on.
 
     Raises:
-        ConfigError: for another name.
+        ConfigError: for another name, or a noise that is negative or not finite.
 
     Example:
         >>> fault = CameraFault("dark", 0.0, onset=1)
@@ -61,6 +61,8 @@ class CameraFault:
     def __init__(self, name: str, strength: float, *, onset: int = 10, seed: int = 0, noise: float = 0.0) -> None:
         if name not in FAULTS:
             raise ConfigError(f"expected one of the faults {', '.join(FAULTS)}, received {name!r}")
+        if not 0.0 <= noise < math.inf:
+            raise ConfigError(f"expected a finite noise >= 0, received {noise}")
         self.name, self.strength, self.onset, self.noise = name, float(strength), onset, noise
         self.generator = torch.Generator().manual_seed(seed)
         self.history: list[Tensor] = []  # frames as they were, since the onset

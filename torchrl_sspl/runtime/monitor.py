@@ -442,8 +442,9 @@ def calibrate(
         seed: root of everything drawn.
         progress: show progress bars.
 
-    Raises ConfigError if no start lies in the set. Source: none.
+    Raises ConfigError for a noise that is negative or not finite, or if no start lies in the set. Source: none.
     """
+    camera = CameraFault("dark", 1.0, noise=noise, seed=spawn(seed, "monitor", 3))
     agent = copy.deepcopy(agent).cpu()  # where the system is
     g = torch.Generator().manual_seed(spawn(seed, "monitor", 0))
     with torch.random.fork_rng():
@@ -458,7 +459,7 @@ def calibrate(
     wide = {name: (-math.inf, math.inf) for name in SIGNALS}
     calibration = Calibration(model, wide, episodes, horizon, weights_digest(agent.state_dict()))
     start = starts(agent, env, episodes, g)
-    watching = Watching(agent, calibration, change=CameraFault("dark", 1.0, noise=noise, seed=spawn(seed, "monitor", 3)))
+    watching = Watching(agent, calibration, change=camera)
     simulate(watching, env, start=start, horizon=horizon, label="clean episodes" if progress else None)
     for name, (low, high) in watching.extremes().items():
         most, least = float(high.max()), float(low.min())
