@@ -271,6 +271,16 @@ def test_actions_of_a_user_come_out_again():
         store.extend(episode(4))
 
 
+@pytest.mark.parametrize("name", ["user_action", "residual"])
+def test_an_entry_that_earlier_transitions_lack_is_refused(name):
+    store = TransitionStore(8)
+    store.extend(episode(4))
+    with pytest.raises(ShapeError, match=f"expected no '{name}', as in the transitions that it holds, received one"):
+        store.extend(episode(4).set(name, torch.ones(4, 1)))
+    assert len(store) == 4
+    assert name not in store.get(slice(None))
+
+
 def test_unreadable_files_are_named(tmp_path):
     with pytest.raises(CheckpointError, match="cannot read"):
         TransitionStore.from_folder(tmp_path / "nowhere")

@@ -203,11 +203,13 @@ class TransitionStore(Storage):
         rows = {"action": action.reshape(n, -1), "region": region.reshape(n, 1)}
         rows["next_region"] = data.get(("next", "region"), torch.zeros_like(region)).reshape(n, 1)
         for name in _GIVEN:
-            value = data.get(name, None)
+            value, held = data.get(name, None), name in self._columns
+            if self._len and held != (value is not None):  # there is no value for those that lack it
+                lacks = f"expected {name!r}, as in the transitions that it holds, found none"
+                brings = f"expected no {name!r}, as in the transitions that it holds, received one"
+                raise ShapeError(f"store: {lacks if held else brings}; give it with all transitions or with none.")
             if value is not None:
                 rows[name] = value.reshape(n, -1)
-            elif name in self._columns:
-                raise ShapeError(f"store: expected {name!r}, as in the transitions that it holds, found none.")
         ended = data.get(("next", "terminated"), None)
         rows["terminated"] = torch.zeros(n, 1, dtype=torch.bool) if ended is None else ended.reshape(n, 1)
         if self.keep_state:
