@@ -299,6 +299,18 @@ def test_single_positions_have_no_batch_dimension():
         store.get(10)
 
 
+def test_a_mask_reads_the_rows_that_it_marks():
+    store = TransitionStore(10)
+    store.extend(episode(5))
+    mask = torch.tensor([False, True, False, True, True])
+    for given in (mask, mask.tolist(), mask.numpy()):
+        assert (store.get(given) == store.get(torch.tensor([1, 3, 4]))).all()
+    assert len(store.get(torch.zeros(5, dtype=torch.bool))) == 0
+    for wrong in (torch.ones(10, dtype=torch.bool), mask[:, None]):
+        with pytest.raises(ShapeError, match=r"expected a mask \(5,\), received"):
+            store.get(wrong)
+
+
 def test_the_states_are_kept_only_on_request():
     store = TransitionStore(10)
     store.extend(episode(10))

@@ -220,7 +220,7 @@ class TransitionStore(Storage):
         return {name: value.detach().cpu() for name, value in rows.items()}
 
     def get(self, index: Any) -> TensorDict:
-        """Transitions at given positions: an integer, a slice, or an integer tensor."""
+        """Transitions at given positions: an integer, a slice, an integer tensor, or a mask over all of them."""
         single = isinstance(index, int) or (isinstance(index, Tensor) and index.ndim == 0)
         rows = _positions(index, self._len)
         if rows.numel() and (int(rows.max()) >= self._len or int(rows.min()) < 0):
@@ -368,7 +368,12 @@ def _column(name: str, rows: Tensor, size: int) -> Tensor:
 def _positions(index: Any, size: int) -> Tensor:
     if isinstance(index, slice):
         return torch.arange(*index.indices(size))
-    return torch.as_tensor(index, dtype=torch.int64).reshape(-1).cpu()
+    index = torch.as_tensor(index)
+    if index.dtype == torch.bool:
+        if index.shape != (size,):
+            raise ShapeError(f"store: expected a mask {(size,)}, received {tuple(index.shape)}; give it one value for every transition.")
+        index = index.nonzero()
+    return index.to(torch.int64).reshape(-1).cpu()
 
 
 def _observations(data: TensorDictBase) -> tuple[Tensor, Tensor]:
