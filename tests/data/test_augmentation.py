@@ -120,6 +120,15 @@ def test_an_episode_that_is_stored_has_one_camera_and_every_frame_one_change():
     assert not torch.equal(found, plain.get(torch.arange(12))["frames"])
 
 
+def test_what_takes_the_place_of_others_has_a_camera_of_its_own():
+    store, data = TransitionStore(6, augmentation=Augmentation(share=1.0)), transitions(6)
+    seen = []
+    for _ in range(2):
+        store.extend(data)
+        seen.append(store.get(torch.arange(6))["frames"])
+    assert not torch.equal(*seen)
+
+
 def test_a_training_sees_changed_pictures_and_another_one_the_same(tmp_path):
     words = [*SINGLE, "synthesis.enabled=false", "evaluation.episodes=0"]
 

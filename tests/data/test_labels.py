@@ -128,6 +128,31 @@ def test_a_store_holds_no_more_labels_than_it_may():
     assert plain.get(slice(None))["next", "region"].flatten().tolist() == [1, 2, 0]
 
 
+@pytest.mark.parametrize("options", [{"wrong": 0.5}, {"share": 0.5}, {"wrong": 0.5, "safe": 999, "unsafe": 999, "choose": 1}])
+def test_what_takes_the_place_of_others_gets_labels_of_its_own(options):
+    labels, data = Labels(**options, seed=3), rows(codes(SAFE).repeat(40, 1))
+    store = TransitionStore(80, labels=labels)
+    name, found = "answer" if labels.choose else "region", []
+    for k in range(4):  # twice through the ring
+        store.extend(data)
+        found.append(store.get(slice(40 * (k % 2), 40 * (k % 2) + 40))[name])
+        said = labels.answers if labels.choose else labels
+        assert torch.equal(found[-1], said(data["region"], position=40 * k))
+    assert not any(torch.equal(found[a], found[b]) for a in range(4) for b in range(a))
+
+    other = TransitionStore(80, labels=labels)
+    other.load_state_dict(store.state_dict())
+    for each in (store, other):
+        each.extend(data)
+    assert torch.equal(store.get(slice(0, 40))[name], other.get(slice(0, 40))[name])
+    with pytest.raises(ShapeError):
+        store.extend(data.exclude("pixels"))
+    assert store.recorded == 200  # what is refused counts for nothing
+    store.recorded = 2**24  # more than a seed can tell apart
+    store.extend(data)
+    assert torch.equal(store.get(slice(40, 80))[name], found[0])
+
+
 def test_what_is_collected_later_gets_what_is_left():
     env = PendulumEnv([16], seed=0)
     store = TransitionStore(64, labels=Labels(safe=3, unsafe=30))

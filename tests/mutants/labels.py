@@ -33,6 +33,7 @@ MUTANTS = [
     (LABELS, " - mine.long()", "", DATA),
     (STORE, "self.given[code] += int(", "self.given[code] = int(", DATA),
     (STORE, "meta.get(\"given\", held)", "held", DATA),
-    (STORE, "        self.recorded += data.shape[0]\n", "        self.recorded = self._len\n", DATA),
+    (STORE, "        self.recorded += n\n", "        self.recorded = self._len\n", DATA),
+    (STORE, "before = self.recorded % _INDICES", "before = int(index[0])", DATA),
     (SOURCE, "\"chosen labels of S\"", "\"labels of S\"", DATA),
 ]

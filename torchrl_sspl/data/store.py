@@ -16,6 +16,7 @@ from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.data.frames import FrameBank
 from torchrl_sspl.data.labels import Labels
 from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, EmptyRegionError, ShapeError
+from torchrl_sspl.seeds import _INDICES
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 _FILE = "transitions.safetensors"
@@ -141,19 +142,22 @@ class TransitionStore(Storage):
         """Write transitions at given positions (the interface of ``Storage``)."""
         index = _positions(cursor, self.max_size)
         data = data.reshape(-1)
-        if index.numel() != data.shape[0]:
-            raise ShapeError(f"store: expected {index.numel()} transitions, received {data.shape[0]}.")
-        self.recorded += data.shape[0]
+        n = data.shape[0]
+        if index.numel() != n:
+            raise ShapeError(f"store: expected {index.numel()} transitions, received {n}.")
         if index.numel() > self.max_size:  # a ring that is passed more than once keeps the last round
             index, data = index[-self.max_size :], data[-self.max_size :]
         if not index.numel():
             return
         now, then = _observations(data)
         columns = self._rows(data)
+        # What is drawn hangs on all that came in before: positions in a ring come again, and their draws would, too.
+        before = self.recorded % _INDICES
+        self.recorded += n
         if self.labels is not None:
             if self.labels.choose:  # which of the others are asked for is decided later, on latents
-                columns["answer"] = self.labels.answers(columns["region"], int(index[0]))
-            columns["region"] = self.labels(columns["region"], self.given, int(index[0]))
+                columns["answer"] = self.labels.answers(columns["region"], before)
+            columns["region"] = self.labels(columns["region"], self.given, before)
             if self.labels.infers:  # elsewhere nothing is said by a picture that has no label
                 columns["drawn"] = self.labels.left(columns["region"], self.given)
             columns["next_region"] = torch.zeros_like(columns["next_region"])
@@ -167,7 +171,7 @@ class TransitionStore(Storage):
         if triples is not None:
             old = triples[index]
             self._bank.hold(old[old[:, 0] >= 0], -1)
-        columns["triple"] = self._store_frames(now, then, int(index[0]))
+        columns["triple"] = self._store_frames(now, then, before)
         for name, rows in columns.items():
             if name not in self._columns:
                 self._columns[name] = _column(name, rows, self.max_size)
@@ -176,7 +180,7 @@ class TransitionStore(Storage):
         self._by_region = {}
         self._bump_mutation_revision()
 
-    def _store_frames(self, now: Tensor, then: Tensor, position: int) -> Tensor:
+    def _store_frames(self, now: Tensor, then: Tensor, before: int) -> Tensor:
         """Store the frames of transitions, each once; returns the frame numbers ``(n, 3)``."""
         linked = torch.zeros(now.shape[0], dtype=torch.bool)
         linked[1:] = (now[1:] == then[:-1]).flatten(1).all(1)
@@ -190,7 +194,7 @@ class TransitionStore(Storage):
         frames = torch.cat([now[~linked, :3], now[~linked, 3:], then[:, 3:]])
         if self.augmentation is not None:
             episode = (~linked).cumsum(0) - 1
-            frames = self.augmentation(frames, torch.cat([episode[~linked], episode[~linked], episode]), position)
+            frames = self.augmentation(frames, torch.cat([episode[~linked], episode[~linked], episode]), before)
         self._bank.write(places, frames)
         self._bank.hold(triple, +1)
         return triple
