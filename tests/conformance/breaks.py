@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from torchrl_sspl.objectives import ConsistencyLoss, PolicyDeviationLoss, SaLaDLoss, SynthesisLoss
-from torchrl_sspl.objectives.base import LatentBatch
+from torchrl_sspl.objectives.base import LatentBatch, _valid
 
 from .cases import CASES, Case
 
@@ -160,7 +160,7 @@ class CopiesItsNetworks(SaLaDLoss):
 class MasksTheOutputOnly(SaLaDLoss):
     def _read(self, tensordict: TensorDict) -> LatentBatch:
         batch = super()._read(tensordict.exclude(*self._loss_mask_keys()))
-        batch.valid = self._valid(tensordict)
+        batch.valid = _valid(tensordict, self._loss_mask_keys())
         return batch
 
 

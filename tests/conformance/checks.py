@@ -264,7 +264,8 @@ def keyword_call_equals_tensordict_call(case: Case, kind: Kind) -> None:
 def outputs_can_be_selected(case: Case, kind: Kind) -> None:
     loss = case.build(kind)
     key = sorted(case.reaches)[0]
-    expected = run(loss, case.data())[key]
+    everything = run(loss, case.data())
+    expected = everything[key]
     loss.select_out_keys(key)
     output = run(loss, case.data())
     expect(set(output.keys()) == {key}, f"received {set(output.keys())}")
@@ -280,6 +281,9 @@ def outputs_can_be_selected(case: Case, kind: Kind) -> None:
         isinstance(value, Tensor) and torch.allclose(value, expected),
         "the keyword call selects something else",
     )
+    expect(loss.reset_out_keys() is loss, "reset_out_keys does not return the loss")
+    expect(loss.out_keys == loss.out_keys_source, f"after the reset out_keys are {loss.out_keys}")
+    expect(set(run(loss, case.data()).keys()) == set(everything.keys()), "the reset does not give all outputs again")
 
 
 @check

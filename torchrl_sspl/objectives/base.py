@@ -113,6 +113,17 @@ def _same(held: Tensor | None, value: Tensor) -> bool:
     return held is value or (held is not None and not value.requires_grad and held.data_ptr() == value.data_ptr())
 
 
+def _valid(tensordict: TensorDictBase, masks: Iterable[NestedKey]) -> Tensor | None:
+    """Rows ``(*batch, 1)`` that count by every mask that a batch holds, or ``None`` for all."""
+    valid = None
+    for key in masks:
+        mask = tensordict.get(key, None)
+        if mask is not None:
+            mask = _batch_last(mask, tensordict.batch_size).bool()
+            valid = mask if valid is None else valid & mask
+    return valid
+
+
 def _clean(value: Any, valid: Tensor | None) -> Any:
     """Zero in the rows that do not count: a masked NaN behind a network still poisons its gradients."""
     if value is None or valid is None or not value.is_floating_point():
@@ -353,6 +364,11 @@ class LatentLoss(LossModule):
         self._out_keys_apparent = list(out_keys)
         return self
 
+    def reset_out_keys(self) -> LatentLoss:
+        """Gives all entries of the output again."""
+        self._out_keys_apparent = list(self.out_keys_source)  # there is no hook of TensorDict's to take away
+        return self
+
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
         network, key = getattr(self, name), self._written[name]
@@ -401,15 +417,6 @@ class LatentLoss(LossModule):
         """An entry, zero in the rows that do not count."""
         return _clean(self._get(tensordict, key, field), batch.valid)
 
-    def _valid(self, tensordict: TensorDictBase) -> Tensor | None:
-        valid = None
-        for key in self._loss_mask_keys():
-            mask = tensordict.get(key, None)
-            if mask is not None:
-                mask = _batch_last(mask, tensordict.batch_size).bool()
-                valid = mask if valid is None else valid & mask
-        return valid
-
     def _encode(
         self, tensordict: TensorDictBase, valid: Tensor | None, now: bool, after: bool, params: str
     ) -> list[Tensor]:
@@ -432,7 +439,7 @@ class LatentLoss(LossModule):
     def _read(self, tensordict: TensorDictBase) -> LatentBatch:
         """Latents, action, labels and masks of a batch, as far as the active terms need them."""
         keys, needs = self.tensor_keys, self._needs
-        valid = self._valid(tensordict)
+        valid = _valid(tensordict, self._loss_mask_keys())
         latents = self._encode(tensordict, valid, True, "next_latent" in needs, "online")
         batch = LatentBatch(latents[0], valid=valid)
         if "residual" in needs:
