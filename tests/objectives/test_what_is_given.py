@@ -109,6 +109,44 @@ def test_a_users_policy_that_reads_what_is_not_there_is_told_so() -> None:
         PolicyDeviationLoss(None, Policy(2, 1), user_policy=user)(three())
 
 
+def test_what_a_users_policy_reads_is_among_the_keys_of_the_loss() -> None:
+    user = TensorDictModule(nn.Linear(3, 1), ["goal"], ["action"])
+    data = three().set("goal", torch.rand(3, 3))
+    for loss in (PolicyDeviationLoss(None, Policy(2, 1), user_policy=user), SSPLLoss(*_nets(), policy_coeff=1.0, user_policy=user)):
+        assert loss.in_keys.count("goal") == 1
+        loss.select_out_keys("loss_policy_deviation")
+        flat = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in loss.in_keys if key in data.keys(True)}
+        torch.testing.assert_close(loss(**flat), loss(data)["loss_policy_deviation"])
+    reads_latents = TensorDictModule(nn.Linear(2, 1), ["latent"], ["action"])
+    assert PolicyDeviationLoss(None, Policy(2, 1), user_policy=reads_latents).in_keys.count("latent") == 1
+
+
+def test_a_users_policy_may_name_its_action_otherwise() -> None:
+    net, data = nn.Linear(2, 1), three()
+    wanted = PolicyDeviationLoss(None, Reads(), user_policy=net)(data)["loss_policy_deviation"]
+    loss = PolicyDeviationLoss(None, Reads(), user_policy=TensorDictModule(net, ["latent"], ["wish"]))
+    torch.testing.assert_close(loss(data)["loss_policy_deviation"], wanted)
+    both = TensorDictSequential(TensorDictModule(nn.Identity(), ["latent"], ["u"]), TensorDictModule(net, ["u"], ["action"]))
+    loss = PolicyDeviationLoss(None, Reads(), user_policy=both)
+    for name in ("action", "other"):
+        loss.set_keys(action=name)
+        torch.testing.assert_close(loss(data)["loss_policy_deviation"], wanted)
+    many = TensorDictModule(lambda latent: (latent, latent), ["latent"], ["loc", "scale"])
+    with pytest.raises(ConfigError, match=r"a module that writes 'action', or one entry alone, received one that writes \['loc', 'scale'\]"):
+        PolicyDeviationLoss(None, Reads(), user_policy=many)
+
+
+@pytest.mark.parametrize("wrap", [lambda net: net, lambda net: TensorDictModule(net, ["latent"], ["action"])])
+def test_a_users_policy_is_cast_with_the_loss_that_does_not_train_it(wrap) -> None:
+    net = nn.Linear(2, 1)
+    loss = PolicyDeviationLoss(None, Policy(2, 1), user_policy=wrap(net))
+    before = len(list(loss.parameters())), sorted(loss.state_dict())
+    loss.to(torch.float64)
+    assert loss(three().to(torch.float64))["loss_policy_deviation"].dtype == net.weight.dtype == torch.float64
+    assert (len(list(loss.parameters())), sorted(loss.state_dict())) == before
+    assert not any(net.weight is parameter for parameter in loss.parameters())
+
+
 def test_rows_that_do_not_count_are_no_counterexamples() -> None:
     data = TensorDict(latent=latents(-0.5, -0.5), batch_size=[2])
     loss = CounterexampleLoss(Adds(), Reads(), Shift())

@@ -88,6 +88,12 @@ def _forget(loss: Any, *_: Any) -> None:
     loss._erase_cache()
 
 
+def _meant(loss: LatentLoss, name: str, network: Any) -> NestedKey:
+    """Which of the entries that a network writes is meant."""
+    action = loss.tensor_keys.action  # its name may have been changed since
+    return action if name in ("actor_network", "user_policy") and action in network.out_keys else loss._written[name]
+
+
 def _called(name: str, network: Any, inputs: tuple[Tensor, ...], method: str | None, key: NestedKey) -> Tensor:
     """What a network gives, of several things the one with a key; a ShapeError if it is a barrier of another shape."""
     if method is not None:
@@ -371,9 +377,8 @@ class LatentLoss(LossModule):
 
     def _run(self, name: str, *inputs: Tensor, params: str = "online", method: str | None = None) -> Tensor:
         """Runs a network with ``online``, ``target`` or ``frozen`` (online, detached) parameters."""
-        network, key = getattr(self, name), self._written[name]
-        if name == "actor_network" and self.tensor_keys.action in network.out_keys:  # its name may have been changed since
-            key = self.tensor_keys.action
+        network = getattr(self, name)
+        key = _meant(self, name, network)
         if params != "target" and not is_compiling():
             leaves = _leaves(self, name, network)
             if all(_same(where.get(leaf), value) for where, leaf, value in leaves):  # nothing has to be put into it

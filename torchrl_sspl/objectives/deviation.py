@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.functional import policy_deviation
-from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, _clean, set_action_scale, trained_action
+from torchrl_sspl.modules.salad import written
+from torchrl_sspl.objectives.base import LatentBatch, LatentLoss, _clean, _meant, set_action_scale, trained_action
 
 
 class PolicyDeviationLoss(LatentLoss):
@@ -26,8 +27,9 @@ class PolicyDeviationLoss(LatentLoss):
         encoder: observation -> latent ``(*batch, p)``; ``None`` if the batches hold ``"latent"``.
         policy: latent -> action ``(*batch, action_dim)`` in physical units.
         user_policy: ``None`` for the zero action (the paper's pendulum), ``"data"`` to read ``"user_action"`` from the
-            batch, or a module that is run without gradient and stays outside the parameters of the loss: a TensorDict
-            module on the batch, a plain network on the observation (on the latent without encoder).
+            batch, or a module that is run without gradient and stays outside the parameters of the loss, but is moved and
+            cast with it: a TensorDict module on the batch that writes ``"action"``, or one entry alone, a plain network on
+            the observation (on the latent without encoder).
         detach: ``("encoder",)`` keeps the gradient of this loss out of the encoder.
         **shared: ``reduction``; see :class:`LatentLoss`, for errors too.
 
@@ -59,20 +61,32 @@ class PolicyDeviationLoss(LatentLoss):
         self.__dict__["user_policy"] = user_policy
         if user_policy == "data":
             self._needs.add("user_action")
+        elif isinstance(user_policy, TensorDictModuleBase):
+            self._written["user_policy"] = written(user_policy, self.tensor_keys.action)
         self.out_keys.append("loss_policy_deviation")
+
+    def _apply(self, fn: Any) -> PolicyDeviationLoss:
+        if isinstance(user := self.__dict__["user_policy"], nn.Module):  # torch finds only what is registered
+            user._apply(fn)
+        return super()._apply(fn)
+
+    def _set_in_keys(self) -> None:
+        super()._set_in_keys()
+        if isinstance(user := self.__dict__["user_policy"], TensorDictModuleBase):
+            self.in_keys += [key for key in user.in_keys if key not in self.in_keys]
 
     def _read(self, tensordict: TensorDictBase) -> LatentBatch:
         batch = super()._read(tensordict)
-        keys, user = self.tensor_keys, self.__dict__["user_policy"]
+        user = self.__dict__["user_policy"]
         if user is None:
             return batch
         if user == "data":
-            action = self._get(tensordict, keys.user_action, "user_action")
+            action = self._get(tensordict, self.tensor_keys.user_action, "user_action")
         else:
             with torch.no_grad():
                 if isinstance(user, TensorDictModuleBase):
                     read = {key: self._get(tensordict, key, "observation") for key in user.in_keys}
-                    action = user(TensorDict(read, tensordict.batch_size)).get(keys.action)
+                    action = user(TensorDict(read, tensordict.batch_size)).get(_meant(self, "user_policy", user))
                 else:
                     action = user(self._get(tensordict, self.in_keys[0], "observation"))
         batch.user_action = _clean(action.detach(), batch.valid)
