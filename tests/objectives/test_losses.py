@@ -351,6 +351,8 @@ def _nets() -> tuple[None, nn.Module, nn.Module, nn.Module]:
         ({"saturation_limit": 1.0}, r"saturation_limit.*1\.0"),
         ({"safty_margin": 0.1}, r"safety_margin.*safty_margin"),
         ({"user_policy": "zero", "policy_coeff": 1.0}, r"user_policy.*'zero'"),
+        ({"user_policy": "data"}, r"policy_coeff > 0 with a user_policy, received 0\.0 with preset='sound': .*give policy_coeff"),
+        ({"user_policy": nn.Linear(2, 1), "preset": "paper", "policy_coeff": 0}, r"policy_coeff > 0 with a user_policy, received 0 with preset='paper'"),
     ],
 )
 def test_wrong_options_are_named_with_the_valid_ones(options: dict[str, object], message: str) -> None:

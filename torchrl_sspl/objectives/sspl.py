@@ -52,7 +52,7 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
             by inverse dynamics and the spread of the latents, a wide and light hinge, invariance as R3 with gradient to
             barrier and policy only, slow growth, hard mining.
         synthesis_coeff, salad_coeff, policy_coeff: :math:`\lambda_1, \lambda_2, \lambda_3`; a ``policy_coeff`` of 0
-            leaves the term out.
+            (in ``"sound"``) leaves the term out, and is refused with a ``user_policy``.
         **options: options of the three losses.
 
     Example:
@@ -89,9 +89,12 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
         self.preset = preset
         self._coefficients(**{f"{name}_coeff": value for name, value in weights.items()})
         if "policy_coeff" not in self._active:
+            if options.get("user_policy") is not None:
+                raise ConfigError(
+                    f"expected policy_coeff > 0 with a user_policy, received {weights['policy']} with preset={preset!r}: nothing would keep the policy "
+                    "near it; give policy_coeff=1.0, for instance, or no user_policy"
+                )
             self.out_keys.remove("loss_policy_deviation")
-            self._needs.discard("user_action")
-            self.__dict__["user_policy"] = None
 
     @dispatch
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
