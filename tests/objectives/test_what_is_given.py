@@ -147,6 +147,28 @@ def test_a_users_policy_is_cast_with_the_loss_that_does_not_train_it(wrap) -> No
     assert not any(net.weight is parameter for parameter in loss.parameters())
 
 
+def test_frames_in_rows_that_do_not_count_may_be_nan() -> None:
+    class Mean(nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.net = nn.Linear(2, 2)
+
+        def sequence(self, frames: Tensor) -> Tensor:
+            mean = frames.mean((-1, -2, -3))
+            return self.net(torch.stack([mean[..., :-1], mean[..., 1:]], -1))
+
+    torch.manual_seed(0)
+    loss = SaLaDLoss(Mean(), Adds(), Reads(), consistency="online", variance_coeff=1.0)
+    data = three().set("frames", torch.rand(3, 3, 3, 1, 2)).set(("collector", "mask"), torch.tensor([True, True, False]))
+    wanted = loss(data)
+    data["frames"][2] = torch.nan
+    found = loss(data)
+    for key in sorted(wanted.keys()):
+        torch.testing.assert_close(found[key], wanted[key])
+    sum(value for key, value in found.items() if key.startswith("loss_")).backward()
+    assert all(bool(parameter.grad.isfinite().all()) for parameter in loss.parameters() if parameter.grad is not None)
+
+
 def test_rows_that_do_not_count_are_no_counterexamples() -> None:
     data = TensorDict(latent=latents(-0.5, -0.5), batch_size=[2])
     loss = CounterexampleLoss(Adds(), Reads(), Shift())

@@ -429,7 +429,7 @@ class LatentLoss(LossModule):
         keys = self.tensor_keys
         key, field = (keys.latent, "latent") if self.encoder is None else (keys.observation, "observation")
         if self.encoder is not None and hasattr(getattr(self.encoder, "module", None), "sequence"):
-            frames = tensordict.get(keys.frames, None)
+            frames = _clean(tensordict.get(keys.frames, None), valid)
             if frames is not None:
                 used = frames.narrow(-4, 0 if now else 1, 3 if now and after else 2)
                 return list(self._run("encoder", used, params=params, method="sequence").unbind(-2))
