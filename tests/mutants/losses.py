@@ -8,7 +8,8 @@ LOSSES, STORED = "tests/objectives/test_what_is_given.py", "tests/data/test_stor
 MUTANTS = [
     (BASE, "output[network.out_keys.index(key)]", "output[0]", LOSSES),
     (BASE, "if name == \"barrier\" and output.shape", "if False and output.shape", LOSSES),
-    (BASE, "name in self.__dict__.get(\"_left_out\", ())", "False", LOSSES),
+    (BASE, "if name in loss.__dict__.get(\"_left_out\", ()) and", "if False and", LOSSES),
+    (BASE, "        self.register_load_state_dict_pre_hook(_check_loaded)\n", "", LOSSES),
     (SALAD, "< len(out_keys) or swapped:", "< len(out_keys):", LOSSES),
     ("torchrl_sspl/objectives/counterexample.py", "found = torch.where(counted, found, 0.0)", "found = found * 1.0", LOSSES),
     ("torchrl_sspl/objectives/target.py", "inside = _batch_last(self._get(tensordict, keys.inside, \"inside\"), batch.shape)", "inside = self._get(tensordict, keys.inside, \"inside\")", LOSSES),

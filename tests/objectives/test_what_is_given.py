@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from tensordict import TensorDict
@@ -77,14 +79,25 @@ def test_targets_may_lack_their_last_dimension() -> None:
     (lambda **weight: TargetLoss(Reads(), Reads(), **weight), "unsafe_coeff"),
 ])  # fmt: skip
 def test_a_term_that_was_left_out_cannot_be_weighted_later(make, name: str) -> None:
-    loss = make(**{name: 0.0})
+    left_out, loss = make(**{name: 0.0}), make(**{name: 0.5})
+    for value in (0.5, torch.tensor(0.5)):
+        with pytest.raises(ConfigError, match=f"expected {name} > 0 when .* is made.* with {name}=0.5 and"):
+            setattr(left_out, name, value)
+    for given in (left_out, copy.deepcopy(left_out)):
+        with pytest.raises(ConfigError, match=f"expected {name} > 0 when .* is made"):
+            given.load_state_dict(left_out.state_dict() | {name: loss.state_dict()[name]})
+        assert float(getattr(given, name)) == 0.0
+    nested = nn.ModuleDict({"loss": left_out})
     with pytest.raises(ConfigError, match=f"expected {name} > 0 when .* is made"):
-        setattr(loss, name, 0.5)
-    setattr(loss, name, 0.0)
-    loss = make(**{name: 0.5})
-    setattr(loss, name, 0.0)
-    setattr(loss, name, 0.25)
-    assert float(getattr(loss, name)) == 0.25
+        nested.load_state_dict(nested.state_dict() | {f"loss.{name}": torch.tensor(0.5)})
+    left_out.load_state_dict(left_out.state_dict())
+    for value in (0.0, torch.tensor(0.0)):
+        setattr(left_out, name, value)
+    for value in (0.0, 0.25, torch.tensor(0.25)):
+        setattr(loss, name, value)
+        assert float(getattr(loss, name)) == float(value)
+    loss.load_state_dict(make(**{name: 0.75}).state_dict())
+    assert float(getattr(loss, name)) == 0.75
 
 
 def test_an_encoder_without_sequence_is_told_how_to_get_observations() -> None:

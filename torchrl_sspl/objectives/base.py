@@ -88,6 +88,20 @@ def _forget(loss: Any, *_: Any) -> None:
     loss._erase_cache()
 
 
+def _check_raised(loss: Any, name: str, value: Any) -> None:
+    """A ConfigError for a weight whose term was left out and that is raised: it would change, and nothing else."""
+    if name in loss.__dict__.get("_left_out", ()) and isinstance(value, (int, float, Tensor)) and (raised := float(value)) > 0:
+        raise ConfigError(
+            f"expected {name} > 0 when {type(loss).__name__} is made, if it is to be raised later, received 0 then and {raised:g} now: its term is not "
+            f"computed. Make the loss with {name}={raised:g} and set it to 0 until it is wanted"
+        )
+
+
+def _check_loaded(loss: LossModule, state: dict[str, Any], prefix: str, *_: Any) -> None:
+    for name in loss.__dict__.get("_left_out", ()):
+        _check_raised(loss, name, state.get(prefix + name))
+
+
 def _meant(loss: LatentLoss, name: str, network: Any) -> NestedKey:
     """Which of the entries that a network writes is meant."""
     action = loss.tensor_keys.action  # its name may have been changed since
@@ -261,6 +275,7 @@ class LatentLoss(LossModule):
                 f"expected options of {type(self).__name__} among {self.options()}, received {sorted(unknown)}"
             )
         super().__init__()
+        self.register_load_state_dict_pre_hook(_check_loaded)
         self.register_load_state_dict_post_hook(_forget)
         self._in_keys: list[NestedKey] | None = None
         self._networks_used: list[str] = []
@@ -296,12 +311,7 @@ class LatentLoss(LossModule):
             self._add("actor_network", policy, [keys.latent], [keys.action], delayed)
 
     def __setattr__(self, name: str, value: Any) -> None:
-        # Without this the weight would change, and nothing else.
-        if isinstance(value, (int, float)) and value > 0 and name in self.__dict__.get("_left_out", ()):
-            raise ConfigError(
-                f"expected {name} > 0 when {type(self).__name__} is made, if it is to be raised later, received 0 then and {value} now: its term is not "
-                f"computed. Make the loss with {name}={value} and set it to 0 until it is wanted"
-            )
+        _check_raised(self, name, value)
         super().__setattr__(name, value)
 
     @classmethod
