@@ -48,6 +48,13 @@ class Adds(nn.Module):
         return torch.cat([latent[..., :1] + self.gain * action, latent[..., 1:]], -1)
 
 
+class Sums(nn.Module):
+    """Latent plus an action of as many components."""
+
+    def forward(self, latent: Tensor, action: Tensor) -> Tensor:
+        return latent + action
+
+
 def latents(*values: float) -> Tensor:
     return torch.tensor([[value, 0.0] for value in values])
 
@@ -222,6 +229,16 @@ def test_inverse_dynamics_is_in_units_of_the_largest_action() -> None:
     data = batch(latents(0.0), latents(1.0), torch.tensor([[5.0]]), [0])
     loss = SaLaDLoss(None, Adds(), Reads(), inverse_dynamics_coeff=1.0, inverse_dynamics=Difference())
     assert loss(data)["loss_inverse_dynamics"].item() == pytest.approx((4.0 / 10.0) ** 2)
+
+
+def test_inverse_dynamics_is_the_mean_over_the_components_of_the_action() -> None:
+    class Nothing(nn.Module):
+        def forward(self, latent: Tensor, following: Tensor) -> Tensor:
+            return torch.zeros_like(latent)
+
+    loss = SaLaDLoss(None, Sums(), Reads(), consistency="online", inverse_dynamics_coeff=1.0, inverse_dynamics=Nothing())
+    data = batch(latents(0.0), latents(0.0), torch.tensor([[3.0, 4.0]]), [0])
+    assert loss(data)["loss_inverse_dynamics"].item() == pytest.approx((3.0**2 + 4.0**2) / 2)
 
 
 @pytest.mark.parametrize("user", ["zero", "data", "network", "tensordict module"])

@@ -194,6 +194,13 @@ def test_rows_that_do_not_count_are_no_counterexamples() -> None:
     assert loss(data)["counterexample_max"] == 0.0
 
 
+def test_counterexamples_count_by_their_share_of_all_rows() -> None:
+    loss = CounterexampleLoss(Adds(), Reads(), Shift(), depth=0.01, cap=0.05, policy_coeff=0.3)
+    for others in (0, 1, 3):  # rows that are outside already
+        found = loss(TensorDict(latent=latents(0.0, *[0.5] * others), batch_size=[1 + others]))["loss_counterexample"]
+        assert found.item() == pytest.approx((0.01 + 0.3 * 1.0) / (1 + others))
+
+
 class Shift(nn.Module):
     """A policy that moves every latent by one."""
 

@@ -20,14 +20,15 @@ class CounterexampleLoss(LatentLoss):
     r"""Takes latents that are led out of the set out of it, and leads them back where the policy can.
 
     .. math::
-        L = \operatorname{mean}_{B(z) < b} \left( \frac{\min(\bar v, c)}{c} (b - B(z)) + \kappa v \right), \qquad
+        L = \operatorname{mean} \left( \frac{\min(\bar v, c)}{c} \max(0, b - B(z)) + \kappa v \, [B(z) < b] \right), \qquad
         v = \max(0, \bar B(d(z, \pi(z)) + e) + m), \qquad
         e = \delta \nabla \bar B / \lVert \nabla \bar B \rVert
 
-    with bars over what is held still: the barrier changes at z alone, the policy through its successor alone. The product
-    of both violations, on which :class:`SynthesisLoss` descends, may also lower the barrier at the successor; then the
-    set grows to where nothing was asked of it, and what it meets there are the next counterexamples. Where a set is nearly kept, because
-    its targets are exact, that does not matter, and the smaller of both changes leaves more of it (``mode="least"``):
+    with the mean over all rows, to which those with :math:`B(z) \ge b` add nothing, and with bars over what is held still: the barrier
+    changes at z alone, the policy through its successor alone. The product of both violations, on which :class:`SynthesisLoss` descends,
+    may also lower the barrier at the successor; then the set grows to where nothing was asked of it, and what it meets there are the next
+    counterexamples. Where a set is nearly kept, because its targets are exact, that does not matter, and the smaller of both changes
+    leaves more of it (``mode="least"``):
 
     .. math:: L = \operatorname{mean} \max(0, \min(B(d(z, \pi(z)) + e) + m, b - B(z)))
 

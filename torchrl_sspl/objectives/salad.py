@@ -38,11 +38,11 @@ class SaLaDLoss(LatentLoss):
     ``consistency="online"`` the latent of the same encoder with gradient through both branches. D is every row of the
     batch; S and U are the rows with region code 1 and 2. Extra terms, all off by default:
 
-    * ``inverse_dynamics_coeff``: :math:`\| \hat u(z_t, z_{t+1}) - u_t \|^2` in units of the largest
-      action, from encoded latents: the latent keeps what the action changes;
+    * ``inverse_dynamics_coeff``: :math:`\operatorname{mean}_i (\hat u_i(z_t, z_{t+1}) - u_{t,i})^2` over the components of the action, in
+      units of the largest one, from encoded latents: the latent keeps what the action changes;
     * ``variance_coeff``: :math:`\operatorname{mean}_j \max(0, \sigma_0 - \operatorname{std} z_j)`, against collapse;
     * ``covariance_coeff``: :math:`\tfrac1p \sum_{i \ne j} \operatorname{cov}(z_i, z_j)^2`, against redundancy;
-    * ``saturation_coeff``: :math:`\max(0, \operatorname{artanh}|z_j| - \operatorname{artanh} z_0)^2`,
+    * ``saturation_coeff``: :math:`\operatorname{mean}_j \max(0, \operatorname{artanh}|z_j| - \operatorname{artanh} z_0)^2`,
       against latents that stick to the walls of :math:`[-1, 1]^p`;
     * ``worst_coeff``: adds the mean over the worst ``worst_fraction`` of the rows to the three terms above.
 

@@ -21,12 +21,12 @@ class TargetLoss(LatentLoss):
     r"""Regresses the barrier onto a signed distance and the policy onto the action with the most clearance.
 
     .. math::
-        L = \operatorname{mean} w(t) r^2 + \kappa \operatorname{mean} \omega \|\pi(z) - u^\star\|^2 / u_{\max}^2
+        L = \operatorname{mean} w(t) r^2 + \kappa \operatorname{mean} \omega \operatorname{mean}_i \bigl( (\pi_i(z) - u^\star_i) / u_{\max, i} \bigr)^2
         + \xi_1 \operatorname{mean}_S \max(0, B + \psi) + \xi_2 \operatorname{mean}_U \max(0, -B + \psi)
 
     with :math:`r = B(z) - t` inside the set, :math:`r = \max(0, \min(t, t_{\max}) - B(z))` outside (only the sign
-    matters there), and the weight :math:`w(t) = e^{-|t| / s} + 0.1`, largest at the border. Targets come from
-    :mod:`torchrl_sspl.viability.cloud`. Output: ``loss_target``, ``loss_policy_target``, ``loss_safe``,
+    matters there), the weight :math:`w(t) = e^{-|t| / s} + 0.1`, largest at the border, and the components i of the action.
+    Targets come from :mod:`torchrl_sspl.viability.cloud`. Output: ``loss_target``, ``loss_policy_target``, ``loss_safe``,
     ``loss_unsafe``, weighted. Source: none; the paper trains barrier and policy on the condition alone, from which no
     set grows.
 
