@@ -1,4 +1,8 @@
-"""One registry of seeds: everything random in a run draws from the run's seed and a purpose with a name."""
+"""One registry of seeds: the run's seed and a purpose with a name give a seed that no other purpose of the run has.
+
+Some things are drawn from the run's own seed all the same, as it is or with a fixed number added: the first weights, which of the stored transitions
+go on to the phases on frozen latents, and what these phases draw, such as batches and targets.
+"""
 
 from __future__ import annotations
 
