@@ -14,6 +14,7 @@ from torchrl_sspl.errors import ConfigError
 BACKENDS = ("sync", "process", "ray")
 RESIDUALS = 64  # observed errors nearby from which those of a latent are taken
 LOWEST_LEVEL = -0.2  # to which held-out checks may shift the barrier
+MOST_NEAR_DRAWS = 10  # of rollouts in a round; the next seed is that of the rim of U
 PRESETS = ("sound", "paper", "quick", "smoke")
 _CHOICES = {
     "collector.backend": BACKENDS,
@@ -206,7 +207,7 @@ class SynthesisConfig:
         "in S or U, at most half of them, and others at random.")
     rollout_transitions: int = _option(20_000, "transitions of the policy (with exploration) that every further round "
         "adds: those near the set, of near_draws times as many at most.")
-    near_draws: int = _option(10, "see rollout_transitions; 1 bounds what a training takes by what is asked for.")
+    near_draws: int = _option(10, "see rollout_transitions; at most 10, and 1 bounds what a training takes by what is asked for.")
     rim_transitions: int = _option(8_000, "transitions that start in U that every further round adds: of rim_draws "
         "times as many those whose pictures the barrier puts lowest. With a grid the first round adds as many, anywhere in U.")
     rim_draws: int = _option(5, "see rim_transitions.")
@@ -395,6 +396,11 @@ class Config:
             raise ConfigError(f"expected synthesis.lowest_level between {LOWEST_LEVEL} and 0, or null, received {s.lowest_level}")
         if s.rounds > 1 and s.rollout_transitions < 1:
             raise ConfigError(f"expected synthesis.rollout_transitions >= 1 with synthesis.rounds={s.rounds}, received {s.rollout_transitions}")
+        if s.near_draws > MOST_NEAR_DRAWS:
+            raise ConfigError(
+                f"expected synthesis.near_draws <= {MOST_NEAR_DRAWS}, received {s.near_draws}: more have no seeds of their own; raise "
+                "synthesis.rollout_transitions for more rollouts"
+            )
         return self
 
     def _check_labels(self) -> None:

@@ -21,7 +21,7 @@ from torch.nn import functional as F
 
 from torchrl_sspl.certification.conditions import find_counterexamples
 from torchrl_sspl.certification.loop import closed_loop
-from torchrl_sspl.configs.schema import SynthesisConfig
+from torchrl_sspl.configs.schema import MOST_NEAR_DRAWS, SynthesisConfig
 from torchrl_sspl.direction import within
 from torchrl_sspl.modules.observer import corrected, gain_matrix
 from torchrl_sspl.objectives import (
@@ -95,7 +95,7 @@ class Gather(Phase):
         else:
             parts = [work.latents, self._near_the_set(work)]
             if source.known and s.rim_transitions:
-                parts.append(_rim_of_unsafe(work, 20 * self.number + 10))
+                parts.append(_rim_of_unsafe(work, 20 * self.number + MOST_NEAR_DRAWS))
         parts = [work.filtered(part) for part in parts]
         work.latents = {k: torch.cat([p[k] for p in parts]) for k in parts[0]}
         if source.labels is not None and source.labels.tells:
