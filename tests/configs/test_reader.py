@@ -293,7 +293,7 @@ def test_every_section_is_documented():
 
 def test_more_draws_of_rollouts_than_have_seeds_of_their_own_are_refused():
     compose(["synthesis.near_draws=10"]).check()
-    with pytest.raises(ConfigError, match=r"expected synthesis\.near_draws <= 10, received 11: more have no seeds of their own; raise"):
+    with pytest.raises(ConfigError, match=r"expected synthesis\.near_draws <= 10, received 11"):
         compose(["synthesis.near_draws=11"]).check()
 
 

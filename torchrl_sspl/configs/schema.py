@@ -42,6 +42,7 @@ _LEAST = {
 _ABOVE = {0: "network.lipschitz_bound synthesis.band evaluation.walk_seconds"}
 _MOST = {
     1: "synthesis.leave_share synthesis.safe_share synthesis.cover_share synthesis.return_share",
+    MOST_NEAR_DRAWS: "synthesis.near_draws",
     RESIDUALS: "synthesis.residuals",
 }
 
@@ -396,11 +397,6 @@ class Config:
             raise ConfigError(f"expected synthesis.lowest_level between {LOWEST_LEVEL} and 0, or null, received {s.lowest_level}")
         if s.rounds > 1 and s.rollout_transitions < 1:
             raise ConfigError(f"expected synthesis.rollout_transitions >= 1 with synthesis.rounds={s.rounds}, received {s.rollout_transitions}")
-        if s.near_draws > MOST_NEAR_DRAWS:
-            raise ConfigError(
-                f"expected synthesis.near_draws <= {MOST_NEAR_DRAWS}, received {s.near_draws}: more have no seeds of their own; raise "
-                "synthesis.rollout_transitions for more rollouts"
-            )
         return self
 
     def _check_labels(self) -> None:
