@@ -8,6 +8,7 @@ LATENT, VISION = "torchrl_sspl/baselines/latent_cbf.py", "torchrl_sspl/baselines
 
 PERCEPTION, NERF, PAGE = (f"torchrl_sspl/baselines/{name}.py" for name in ("perception", "nerf_cbf", "page"))
 CHOSEN = "tests/trainers/test_phases.py::test_a_policy_that_chooses_is_checked_at_the_level_at_which_it_runs"
+JUDGED = "tests/trainers/test_selection.py"
 SELECTION, AGENT = "torchrl_sspl/trainers/selection.py", "torchrl_sspl/modules/agent.py"
 SYNTHESIS, OWN = "torchrl_sspl/trainers/synthesis.py", "torchrl_sspl/baselines/sspl.py"
 
@@ -43,7 +44,8 @@ MUTANTS = [
     (SELECTION, "if isinstance(agent.policy, ChoosingPolicy) else", "if False else", CHOSEN),
     (SELECTION, "work.agent(check.level)", "work.agent(0.0)", CHOSEN),
     (SELECTION, "        check.level = level\n", "", CHOSEN),
-    (SELECTION, "started=int(inside.sum())", "started=0", CHOSEN),
+    (SELECTION, "started=started)", "started=0)", JUDGED),
+    (SELECTION, "max(1, len(run) // _STARTED)", "0", JUDGED),
     (AGENT, "if name not in registry and not trust:", "if False:", "tests/modules/test_agent.py"),
     (AGENT, "if not (isinstance(kind, type) and issubclass(kind, nn.Module)):", "if False:", "tests/modules/test_agent.py"),
     (AGENT, "                agent.double()", "                pass", "tests/modules/test_agent.py"),

@@ -62,7 +62,7 @@ def test_a_good_set_passes_and_is_measured():
     assert found.passed
     assert found.reason == ""
     assert (found.unsafe_inside, found.safe_outside, found.left, found.touched) == (0, 0, 0, 0)
-    assert found.size == 0.5
+    assert (found.started, found.size) == (2, 0.5)
     assert found.returned == 0.5
 
 
