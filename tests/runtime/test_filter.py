@@ -174,6 +174,7 @@ def test_what_the_memory_is_given_is_what_was_checked(mode):
     made = Shield(agent, mode=mode, level=0.0, margin=0.02)(latent, wanted)
     assert bool(made.intervened.any())
     assert torch.equal(made.margin, -0.02 - agent.barrier(made.predicted)[:, 0])
+    assert bool((made.margin[latent[:, 0] < 0.5] >= 0.0).all())
     assert not torch.equal(made.predicted, agent.dynamics(latent, made.action))  # a second evaluation is another number
     batch = TensorDict(pixels=latent, prior=latent, is_init=torch.ones(23, 1, dtype=torch.bool), action=wanted, batch_size=[23])
     assert torch.equal(SafetyFilter(agent, mode=mode, level=0.0, margin=0.02)(batch)["next", "prior"], made.predicted)

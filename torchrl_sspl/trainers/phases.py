@@ -94,7 +94,7 @@ class InnerLoop:
         total = 11 if steps == 10 else max(steps, 2)
         cycle = torch.optim.lr_scheduler.OneCycleLR(adam, list(networks.values()), total_steps=total, pct_start=0.1)
         parameters = [p for m in networks for p in m.parameters()]
-        bounded = [part for m in networks for part in m.modules() if hasattr(part, "backtracking_step")]
+        bounded: list[Any] = [part for m in networks for part in m.modules() if hasattr(part, "backtracking_step")]
         if self._saved is None:
             torch.manual_seed(int(torch.randint(2**31, (1,), generator=self.generator)))
         else:
