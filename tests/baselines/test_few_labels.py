@@ -7,12 +7,16 @@ import json
 import runpy
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from tiny import TINY_PHASES
 
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.evaluation.measurements import Evaluation, share
+from torchrl_sspl.experiments.run import Experiment
+from torchrl_sspl.trainers.phases import Check
 
 BENCHMARK = Path(__file__).parents[2] / "benchmarks" / "few_labels.py"
 SIZES = ["score.episodes=4", "score.horizon=3", "score.grid=11", "score.kernel_grid=31", "score.frames=1", "score.shifted=0"]
@@ -141,6 +145,31 @@ def test_a_figure_of_nothing_is_refused(tmp_path):
         runpy.run_path(str(BENCHMARK))["figure"](tmp_path)
 
 
+def test_the_quadruped_is_a_run_with_settings_of_its_own(tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def run(self: Experiment) -> SimpleNamespace:
+        asked.append(self.config)
+        names = ("volume_over_kernel", "safe_rollouts_touch_unsafe", "false_safe", "unsafe_called_safe")
+        evaluation = Evaluation({name: share(name, k, 10) for k, name in enumerate(names)})
+        return SimpleNamespace(checks=[Check(0, 0.0, 0, 0, 0, 0, 1.0, 0.5, True, "")], budget={"labels of S": 20}, evaluation=evaluation)
+
+    monkeypatch.setattr(Experiment, "run", run)
+    words = ["env=quadruped", "labels=20", "labels.choose=20", "transitions=640", "seed=3", f"out={tmp_path}", *SIZES, "env.image_size=32", "network.pool_to=16"]
+    start(monkeypatch, *words)
+    (config,), printed = asked, capsys.readouterr().out
+    s = config.synthesis
+    assert (s.transitions, s.rim_transitions, s.rollout_transitions, s.cover_share, s.retries, s.lowest_level) == (384, 128, 128, 0.0, 1, -0.2)
+    assert (config.labels.safe, config.labels.choose, config.seed, config.evaluation.episodes, config.evaluation.grid) == (20, 20, 3, 4, 11)
+    assert printed.splitlines()[-1].endswith("| 3 | 0 | 0.0 % | 20.0 % | 30.0 % | 10.0 % | - |")
+    start(monkeypatch, *words)
+    assert capsys.readouterr().out == printed
+    assert len(asked) == 1  # a point that has been measured is read
+    with pytest.raises(ConfigError, match="starts: expected none with env=quadruped"):
+        start(monkeypatch, *words, "starts=[0,0.5,0.5]")
+
+
+@pytest.mark.slow
 def test_the_quadruped_is_a_run_that_scores_itself(tmp_path, monkeypatch, capsys):
     small = [*SHORT, "env.image_size=32", "network.pool_to=16", "synthesis.retries=0", "synthesis.grid=9", "synthesis.turns=4", "buffer.batch=24", "trainer.optim_steps_per_batch=1"]
     words = ["env=quadruped", "labels=20", "labels.choose=20", "transitions=640", "seed=0", f"out={tmp_path}", *SIZES, *small]
@@ -152,10 +181,6 @@ def test_the_quadruped_is_a_run_that_scores_itself(tmp_path, monkeypatch, capsys
     assert row["measurements"]["claimed_over_kernel"]["name"] == "volume_over_kernel"
     assert row["measurements"]["claimed_harmless_enter"]["n"] in (0, 4)
     assert printed.splitlines()[-1].endswith("| - |")
-    start(monkeypatch, *words)
-    assert capsys.readouterr().out == printed
-    with pytest.raises(ConfigError, match="starts: expected none with env=quadruped"):
-        start(monkeypatch, *words, "starts=[0,0.5,0.5]")
 
 
 @pytest.mark.slow
