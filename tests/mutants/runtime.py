@@ -47,7 +47,6 @@ MUTANTS = [
     (FILTER, "self.level - self.margin - then[:, 0]", "self.level - then[:, 0]", FILTERED),
     (FILTER, "(torch.where(lost[rows, None], a, b[rows]) for a, b in ((near, taken), (then_near, then)))", "torch.where(lost[rows, None], near, taken[rows]), then[rows]", FILTERED),
     (FILTER, "torch.where(keeps[:, None], then, then_own)", "then", FILTERED),
-    (FILTER, "            after[:, -1] = then  # known\n", "", FILTERED),
     (FILTER, " | (asked == own).all(1)", "", FILTERED),
     (FILTER, "self.agent.policy(latent) if own is None else own,", "self.agent.policy(latent),", FILTERED),
     (FILTER, "keeps = inside & (", "keeps = (", FILTERED),
