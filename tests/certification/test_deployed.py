@@ -17,7 +17,7 @@ from torchrl_sspl.certification.certificate import Reason
 from torchrl_sspl.certification.conditions import decide_invariance, decide_vacuity, largest_error
 from torchrl_sspl.certification.deployed import check_deployed
 from torchrl_sspl.certification.layers import deterministic_layer
-from torchrl_sspl.certification.loop import closed_loop
+from torchrl_sspl.certification.loop import closed_loop, closed_loop_lipschitz
 from torchrl_sspl.errors import StructureError
 from torchrl_sspl.lipschitz import SandwichBarrier, prove_lipschitz
 from torchrl_sspl.lipschitz.layers import FORMS, LAYERS, ORIGINAL, Activation, known_form
@@ -473,3 +473,17 @@ def test_structure_errors_name_a_reason():
     with pytest.raises(StructureError) as error:
         closed_loop(OwnForward(linear([[1.0]])), *[nn.Sequential(linear([[0.5, 0.0]]))] * 2, latent_dim=1, lipschitz_bound=1.0)
     assert Reason[error.value.reason] is Reason.SUBCLASSED
+
+
+@pytest.mark.parametrize("remembers", [False, True])
+def test_the_lipschitz_constant_of_the_loop_is_one(remembers):
+    torch.manual_seed(0)
+    dynamics, policy = LatentDynamics(3, 1, (8,), 2.0, remembers=remembers), Policy(3, 1, (8,), 2.0)
+    with torch.no_grad():
+        policy.net[-1].weight.mul_(5.0)
+        dynamics.net[-1].weight.mul_(0.01)
+        bound = closed_loop_lipschitz(dynamics, policy)
+        z = torch.rand(2000, 3) - 0.5
+        near = z + 1e-3 * torch.randn(2000, 3)
+        slopes = (dynamics(z, policy(z)) - dynamics(near, policy(near))).norm(dim=1) / (z - near).norm(dim=1)
+    assert 0.9 < float(slopes.max()) <= bound

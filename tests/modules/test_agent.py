@@ -416,3 +416,11 @@ def test_the_constructor_and_from_loss_leave_a_training_alone():
 def test_a_barrier_in_training_is_named_and_where_it_belongs():
     with pytest.raises(ConfigError, match=r"plain barrier.*received SandwichBarrier; Agent\.from_networks"):
         Agent(FrameEncoder(2, 32), LatentDynamics(2, 1), SandwichBarrier(2, (8,)), Policy(2, 1), 2.0)
+
+
+def test_a_barrier_that_would_be_read_as_another_one_is_not_saved(saved, tmp_path):
+    agent = Agent.load(saved)
+    agent.barrier = nn.Sequential(*(nn.Tanh() if isinstance(layer, nn.ReLU) else layer for layer in agent.barrier))
+    with pytest.raises(ConfigError, match="as which its description would be read"):
+        agent.save(tmp_path / "other")
+    assert not (tmp_path / "other").exists()

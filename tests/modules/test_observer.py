@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.errors import CheckpointError, ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.evaluation.controllers import AgentController
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.modules import BearingEncoder, FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
@@ -336,3 +336,41 @@ def test_a_picture_of_u_is_judged_with_whatever_the_memory_may_hold():
     assert agent.least_barrier(seen).tolist() == [-0.5] * 4
     shows_all = Agent(*nets, 1.0, gain=0.3)
     assert torch.equal(shows_all.least_barrier(seen), shows_all.barrier(seen)[:, 0])
+
+
+def test_an_episode_without_a_first_picture_knows_nothing_of_the_one_before():
+    controller = load("pendulum").controller(batch_size=2)
+    first = controller.step(None)
+    controller.reset()
+    controller.step(torch.zeros(2, 6, 64, 64, dtype=torch.uint8))
+    controller.step(torch.full((2, 6, 64, 64), 200, dtype=torch.uint8))
+    controller.reset(torch.tensor([0]))
+    again = controller.step(None)
+    assert torch.equal(again.latent[0], first.latent[0])
+    assert not torch.equal(again.latent[1], first.latent[1])
+
+
+class Blank(nn.Module):
+    def forward(self, pixels: Tensor) -> Tensor:
+        return torch.full((len(pixels), 3), math.nan)
+
+
+def test_numbers_that_are_none_are_refused_and_forgotten():
+    agent = load("pendulum")
+    controller, pixels = agent.controller(), torch.zeros(1, 6, 64, 64, dtype=torch.uint8)
+    first = controller.step(pixels)
+    with pytest.raises(NonFiniteError, match="memory stays as it was"):
+        controller.took(torch.full((1, 1), math.nan))
+    seen, agent.encoder = agent.encoder, Blank()
+    assert not controller.step(pixels).latent.isfinite().any()
+    agent.encoder = seen
+    step = controller.step(pixels)
+    assert torch.equal(step.latent, first.latent)  # as of an episode that begins
+    assert not bool(step.applies)
+
+
+def test_an_agent_in_float64_runs():
+    agent = load("pendulum").double()
+    controller = agent.controller()
+    assert controller.step(None).latent.dtype == torch.float64
+    assert controller.step(torch.zeros(1, 6, 64, 64, dtype=torch.uint8)).action.dtype == torch.float64

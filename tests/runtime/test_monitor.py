@@ -299,3 +299,24 @@ def test_a_noise_that_no_camera_has_is_refused(noise):
         CameraFault("dark", 1.0, noise=noise)
     with pytest.raises(ConfigError, match="finite noise"):
         calibrate(None, None, noise=noise)  # before anything is fitted
+
+
+def test_a_latent_that_is_no_number_is_an_alarm_and_the_memory_goes_on_afterwards():
+    monitor, pixels = Monitor.load("pendulum"), torch.zeros(1, 6, 64, 64, dtype=torch.uint8)
+    head = monitor.agent.encoder.forward
+    monitor.agent.encoder.forward = lambda pixels: torch.full((len(pixels), 3), math.nan)
+    found = monitor.step(pixels)
+    assert bool(found.alarm)
+    assert "nan" in found.reasons[0]
+    monitor.agent.encoder.forward = head
+    after = monitor.step(pixels)
+    assert "nan" not in after.reasons[0]
+    assert bool(after.action.isfinite().all())
+    assert not bool(after.applies)
+
+
+def test_a_size_that_changes_is_an_alarm_where_the_encoder_takes_any():
+    monitor = Monitor.load("pendulum")
+    monitor.agent.encoder.image_size = None
+    monitor.step(torch.zeros(1, 6, 64, 64, dtype=torch.uint8))
+    assert monitor.step(torch.zeros(1, 6, 128, 128, dtype=torch.uint8)).reasons == [["size"]]

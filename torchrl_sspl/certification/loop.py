@@ -346,6 +346,8 @@ def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
 
     .. math:: L_{cl} \le 1 + L_{net_d} \sqrt{1 + L_{net_\pi}^2}
 
+    or :math:`\sqrt{(\cdot)^2 + L_{net_\pi}^2}` of that where the dynamics remember the action.
+
     Dynamics and policy are of the forms "residual" and "bounded" with one action scale, else ``StructureError``; a policy that
     chooses has none.
 
@@ -361,4 +363,5 @@ def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:
     if scale is None or own is None or not torch.equal(scale, own):
         raise StructureError("expected modules.LatentDynamics and modules.Policy of one action scale, received others")
     loop, gain = (float(lipschitz_upper(nn.Sequential(*layers))) for layers in (moved, control))
-    return (1.0 + loop * math.sqrt(1.0 + gain * gain)) * (1.0 + 1e-12)
+    seen = 1.0 + loop * math.sqrt(1.0 + gain * gain)
+    return (math.hypot(seen, gain) if getattr(dynamics, "remembers", False) else seen) * (1.0 + 1e-12)

@@ -241,13 +241,20 @@ class Agent(nn.Module):
         """Write ``agent.safetensors`` and ``agent.json`` into a directory, which is created if necessary and returned.
 
         Raises:
-            ConfigError: if the agent has no description of its networks.
+            ConfigError: if the agent has no description of its networks, or its barrier is none of linear layers and ReLU, as which it would
+                be read.
             OutputError: if it cannot be written.
         """
         if "networks" not in self.description:
             raise ConfigError(
                 "expected description['networks'] (class names and arguments of encoder, dynamics, barrier and policy),"
                 " received none; build the agent with a description to save it"
+            )
+        read = mlp_barrier(**self.description["networks"]["barrier"])
+        if [type(layer) for layer in read] != [type(layer) for layer in self.barrier.modules() if layer is not self.barrier]:
+            raise ConfigError(
+                f"expected a barrier like {read}, as which its description would be read, received {self.barrier}; what is proved of one says "
+                "nothing of the other: train it with ReLU, or keep the agent in your own code"
             )
         path = Path(path)
         write(path / WEIGHTS_FILE, as_bytes({k: v.contiguous() for k, v in self.state_dict().items()}))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_sspl.devices import compiled
 from torchrl_sspl.direction import direction_of, within
-from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.modules.observer import completed, corrected, held
 
 
@@ -40,8 +40,9 @@ class Memory:
         """Everything, or what belongs to some of the episodes."""
         if rows is None:
             self.prior = self.begins = None
-        elif self.begins is not None:
+        elif self.begins is not None and self.prior is not None:
             self.begins[rows] = True
+            self.prior = self.prior.index_fill(0, rows, 0.0)  # where no picture comes, the episode before would act on
 
     def correct(self, seen: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Latents and innovations ``(n, p)`` for what is seen ``(n, p)``, where a correction was cut ``(n,)``, and what is seen
@@ -52,9 +53,9 @@ class Memory:
     def expected(self, n: int) -> tuple[Tensor, Tensor]:
         """What is expected ``(n, p)``, zeros where nothing is, and which episodes begin ``(n,)``."""
         if self.begins is None or self.prior is None:
-            self.prior = torch.zeros(n, self.agent.latent_dim, device=self.agent.gain.device)
+            self.prior = torch.zeros(n, self.agent.latent_dim, dtype=self.agent.gain.dtype, device=self.agent.gain.device)
             self.begins = torch.ones(n, dtype=torch.bool, device=self.agent.gain.device)
-        return self.prior, self.begins
+        return self.prior, self.begins | ~self.prior.isfinite().all(1)  # from what is none no correction leads back
 
     def unseen(self, n: int) -> Tensor:
         """Latents ``(n, p)`` where nothing is seen: what was expected. Nothing is remembered."""
@@ -236,6 +237,7 @@ class Controller:
         Raises:
             ConfigError: before the first step since a reset.
             ShapeError: for actions or latents of another shape.
+            NonFiniteError: for NaN or infinity among them.
         """
         if self._last is None:
             raise ConfigError("expected a step before took(), received none since the reset")
@@ -246,6 +248,8 @@ class Controller:
             predicted = self.agent.dynamics(latent, action)
         elif predicted.shape != latent.shape:
             raise ShapeError(f"expected latents {tuple(latent.shape)} after the actions, received {tuple(predicted.shape)}")
+        if not bool(predicted.isfinite().all()):
+            raise NonFiniteError("expected finite actions, and what follows them, received NaN or infinity; the memory stays as it was")
         self._memory.expect(predicted, (~self.begins).nonzero()[:, 0])
 
 

@@ -244,6 +244,8 @@ class Monitor:
         step, predicted, signals = self._look(pixels, *self._controller.expected())
         self._controller.remember(step, predicted)
         signals |= self._compared(pixels, fresh)
+        for k in (~(step.latent.isfinite().all(1) & step.action.isfinite().all(1))).nonzero()[:, 0].tolist():
+            reasons[k].append("nan")
         if self.signals:
             value = torch.stack([signals[name] for name in self.signals], 1)
             low, high = value.new_tensor([self.calibration.limits[name] for name in self.signals]).unbind(1)
@@ -281,6 +283,7 @@ class Monitor:
         if pixels is None:
             return "missing"
         size = getattr(self.agent.encoder, "image_size", None)
+        size = size if size is not None or self._frame is None else self._frame.shape[2:]
         wrong = pixels.ndim != 4 or pixels.shape[1] != 6 or (size is not None and tuple(pixels.shape[2:]) != tuple(size))
         return "kind" if pixels.dtype != torch.uint8 else "size" if wrong else ""
 
