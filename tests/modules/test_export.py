@@ -84,7 +84,36 @@ def test_programmes_of_torch_are_checked_too(tmp_path):
     with torch.no_grad():
         other.policy.action_scale.mul_(1.01)
     with pytest.raises(CertificationError, match="exported"):
-        _compare(DeployedStep(other), tmp_path / "deep" / "agent.pt2", 8)
+        _compare(DeployedStep(other), (tmp_path / "deep" / "agent.pt2").read_bytes(), ".pt2", 8)
+
+
+@pytest.fixture(scope="module")
+def programme(tmp_path_factory):
+    return load("pendulum").export(tmp_path_factory.mktemp("programme") / "agent.pt2", check=0).read_bytes()
+
+
+@pytest.mark.parametrize(("name", "changed"), [("next_latent", 0.0), ("seen_barrier", -100.0), ("innovation", 0.3), ("met", True), ("met", False)])
+def test_all_that_comes_out_is_checked(programme, monkeypatch, name, changed):
+    right = DeployedStep.forward
+
+    def wrong(self, **given):
+        found = dict(zip(OUTPUTS, right(self, **given), strict=True))
+        return tuple((found | {name: torch.full_like(found[name], changed)}).values())
+
+    monkeypatch.setattr(DeployedStep, "forward", wrong)
+    with pytest.raises(CertificationError, match=f"'{name}': [^0]|'{name}': 0.[0-9]*[1-9]"):
+        _compare(DeployedStep(load("pendulum")), programme, ".pt2", 256)
+
+
+def test_a_file_that_is_refused_does_not_replace_one_that_is_right(tmp_path, monkeypatch):
+    agent, path = load("pendulum"), tmp_path / "agent.pt2"
+    agent.export(path, check=8)
+    before = path.read_bytes()
+    agent.barrier[-1].bias.data += 0.1
+    monkeypatch.setattr("torchrl_sspl.modules.export._TOLERANCE", -1.0)
+    with pytest.raises(CertificationError):
+        agent.export(path, check=8)
+    assert path.read_bytes() == before
 
 
 def test_the_callers_agent_is_not_touched(tmp_path):
