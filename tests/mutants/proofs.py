@@ -173,7 +173,8 @@ MUTANTS = [
     (CONDITIONS, "weight=(1.0 - decay,)", "weight=(1.0 + decay,)", MARGINS),
     (CONDITIONS, "constant=(margin + decrement, margin + floor)", "constant=(margin, margin + floor)", MARGINS),
     (CONDITIONS, "found.status != \"proved\", found.witness", "True, found.witness", VACUOUS),
-    (LOOP, "return (1.0 + loop", "return (loop", STILL),
+    (LOOP, "seen = 1.0 + loop", "seen = loop", STILL),
+    (LOOP, "math.hypot(seen, gain)", "seen", "tests/certification/test_deployed.py::test_the_lipschitz_constant_of_the_loop_is_one"),
     # Floating point.
     (FLOATING, "torch.float32: 2.0**-24", "torch.float32: 2.0**-25", UNITS),
     (FLOATING, "for w in step.weights).max()) + 1 + step.roundings", "for w in step.weights).max()) + step.roundings", TERMS),
