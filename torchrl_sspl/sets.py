@@ -214,7 +214,7 @@ class Union(Region):
 class Mixture(Union):
     """Union of regions from which states are drawn in given shares, not negative and not all zero.
 
-    Raises ConfigError if the shares do not fit the parts. Source: none.
+    ``grouped``: whether samples come part by part. Raises ConfigError if the shares do not fit the parts. Source: none.
 
     Example:
         >>> mixture = Mixture([Box([-1.0], [0.0]), Box([1.0], [2.0])], [1, 3])
@@ -222,17 +222,18 @@ class Mixture(Union):
         True
     """
 
-    def __init__(self, parts: Sequence[Region], shares: Sequence[float]) -> None:
+    def __init__(self, parts: Sequence[Region], shares: Sequence[float], *, grouped: bool = True) -> None:
         if len(parts) != len(shares) or min(shares, default=-1) < 0 or not sum(shares) > 0:
             raise ConfigError(f"shares: expected one share >= 0 for each of {len(parts)} regions, received {list(shares)}.")
         kept = [(part, float(share)) for part, share in zip(parts, shares, strict=True) if share > 0]
         super().__init__(*(part for part, _ in kept))
-        self.shares = torch.tensor([share for _, share in kept])
+        self.shares, self.grouped = torch.tensor([share for _, share in kept]), grouped
 
     def sample(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
-        """Samples in the given shares, grouped by part."""
+        """Samples in the given shares."""
         which = torch.multinomial(self.shares.to(device or "cpu"), n, True, generator=generator) if n else torch.zeros(0)
-        return self._by_part(which, generator, device)
+        found = self._by_part(which, generator, device)
+        return found if self.grouped else found[torch.randperm(n, generator=generator, device=device)]
 
 
 def label(state: Tensor, safe: Region, unsafe: Region) -> Tensor:

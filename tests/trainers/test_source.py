@@ -58,6 +58,14 @@ def test_a_region_given_goes_before_the_shares(encoder):
     assert (found.random(32, 0, region=make().unsafe_set)["region"] == UNSAFE).all()
 
 
+@pytest.mark.parametrize("grouped", [True, False])
+def test_rows_that_act_otherwise_start_as_the_others_do(grouped):
+    env = TrainingStarts(make, [400], [0.0, 0.0, 0.5, 0.5], grouped=grouped)(seed=1)
+    unsafe = env.unsafe_set.contains(env.sample_states(400, torch.Generator().manual_seed(0))).float()
+    first, last = float(unsafe[:200].mean()), float(unsafe[200:].mean())
+    assert (first < 0.1 and last > 0.9) if grouped else (abs(first - 0.5) < 0.1 and abs(last - 0.5) < 0.1)
+
+
 def test_training_starts_in_shares_and_other_environments_as_they_do(encoder):
     env = TrainingStarts(make, [4], [0.25, 0.25, 0.25, 0.25])(seed=1)
     assert isinstance(env.initial_set, Mixture)

@@ -118,9 +118,7 @@ class ExploringPolicy(TensorDictModuleBase):
         uniform = self.low + (self.high - self.low) * torch.rand_like(action)
         n = action.shape[0] if action.ndim > 1 else 1
         if n > 1:
-            # Spread over the rows: those that are reset together start grouped by where they start.
-            row, most = torch.arange(n, device=action.device), round(self.random_share * n)
-            swap = ((row + 1) * most // n > row * most // n).reshape(-1, *[1] * (action.ndim - 1))
+            swap = (torch.arange(n, device=action.device) < round(self.random_share * n)).reshape(-1, *[1] * (action.ndim - 1))
         else:
             swap = torch.rand_like(action[..., :1]) < self.random_share
         decided["action"] = torch.where(swap, uniform, noisy.clamp(self.low, self.high))

@@ -289,7 +289,7 @@ class Experiment:
     def _collector(self, policy: Any) -> Any:
         c = self.config.collector
         return make_collector(
-            TrainingStarts(self.make_env, [c.envs], c.starts), policy, backend=c.backend, workers=c.workers,
+            TrainingStarts(self.make_env, [c.envs], c.starts, grouped=not 0.0 < c.random_share < 1.0), policy, backend=c.backend, workers=c.workers,
             frames_per_batch=c.frames_per_batch, total_frames=self.config.trainer.total_frames,
             init_random_frames=self.config.random_frames(), max_frames_per_traj=c.max_frames_per_traj,
             policy_device=self.device, ray_address=c.ray_address, seed=self.config.seed,

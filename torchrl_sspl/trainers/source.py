@@ -36,25 +36,29 @@ _ANSWERS = {SAFE: "chosen labels of S", UNSAFE: "chosen labels of U", UNLABELLED
 Latents = dict[str, Tensor]
 
 
-def starts_of(env: SafetyEnv, shares: Sequence[float]) -> Region:
-    """Where episodes start: anywhere, outside U, in S and in U of an environment that knows them, in four given shares.
+def starts_of(env: SafetyEnv, shares: Sequence[float], *, grouped: bool = True) -> Region:
+    """Where episodes start: anywhere, outside U, in S and in U of an environment that knows them, in four given shares; rows that are
+    reset together in this order, or in any.
 
     Source: paper Section IV (S, U and D are sampled apart).
     """
-    return Mixture([env.state_space, env.state_space - env.unsafe_set, env.safe_set, env.unsafe_set], shares)
+    return Mixture([env.state_space, env.state_space - env.unsafe_set, env.safe_set, env.unsafe_set], shares, grouped=grouped)
 
 
 class TrainingStarts:
-    """Environments for training: where the sets are known, episodes start in them as :func:`starts_of` says."""
+    """Environments for training: where the sets are known, episodes start in them as :func:`starts_of` says.
 
-    def __init__(self, make_env: Callable[..., EnvBase], batch_size: list[int], shares: Sequence[float]) -> None:
-        self.make_env, self.batch_size, self.shares = make_env, batch_size, list(shares)
+    ``grouped``: not where the first rows act otherwise than the others, else it would depend on the start who acts.
+    """
+
+    def __init__(self, make_env: Callable[..., EnvBase], batch_size: list[int], shares: Sequence[float], *, grouped: bool = True) -> None:
+        self.make_env, self.batch_size, self.shares, self.grouped = make_env, batch_size, list(shares), grouped
 
     def __call__(self, seed: int | None = None) -> EnvBase:
         """An environment; others than those of this library start as they always do."""
         env = self.make_env(batch_size=self.batch_size, seed=seed)
         if isinstance(env, SafetyEnv):
-            env.initial_set = starts_of(env, self.shares)
+            env.initial_set = starts_of(env, self.shares, grouped=self.grouped)
         return env
 
 
