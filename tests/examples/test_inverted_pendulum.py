@@ -80,6 +80,7 @@ def test_a_shipped_agent_is_evaluated_and_none_is_trained(program, tmp_path):
     assert not (tmp_path / "log.jsonl").exists()
 
 
+@pytest.mark.slow
 def test_the_paper_preset_reports_its_margins(program, tmp_path):
     words = [w for w in WORDS if w not in ("preset=smoke", "logger=none")]
     options = ["preset=paper", "logger=csv", "evaluation.renderer_episodes=0", "collector.envs=16", "collector.max_frames_per_traj=4"]

@@ -24,7 +24,7 @@ def example():
     return made
 
 
-@pytest.mark.parametrize(("env", "suffix"), [pytest.param("pendulum", "", marks=pytest.mark.slow), ("car", "_car")])
+@pytest.mark.parametrize(("env", "suffix"), [pytest.param("pendulum", "", marks=pytest.mark.slow), pytest.param("car", "_car", marks=pytest.mark.slow)])
 def test_the_example_learns_behind_the_filter_without_entering_u(tmp_path, capsys, example, env, suffix):
     example["main"](env=env, seeds=(0,), batches=2, episodes=6, out_dir=str(tmp_path))
     told = json.loads((tmp_path / f"under_filter{suffix}.json").read_text())

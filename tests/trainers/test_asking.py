@@ -176,6 +176,7 @@ def test_labels_that_are_as_frequent_everywhere_in_u_tell_where_u_ends():
     assert torch.equal(infer_unsafe(z, region, everywhere, steps=400, seed=3), found)
 
 
+@pytest.mark.slow
 def test_what_was_recorded_without_labels_does_not_count_against_u():
     z, answer = box()
     corner = (z > 0.7).all(1).nonzero()[:, 0].repeat(100)  # many more pictures of a part of U, none of them labelled
