@@ -301,13 +301,16 @@ def test_a_noise_that_no_camera_has_is_refused(noise):
         calibrate(None, None, noise=noise)  # before anything is fitted
 
 
-def test_a_latent_that_is_no_number_is_an_alarm_and_the_memory_goes_on_afterwards():
-    monitor, pixels = Monitor.load("pendulum"), torch.zeros(1, 6, 64, 64, dtype=torch.uint8)
+@pytest.mark.parametrize("fallback", ["policy", "stop"])
+def test_a_latent_that_is_no_number_is_an_alarm_and_the_memory_goes_on_afterwards(fallback):
+    monitor, pixels = Monitor.load("pendulum", fallback=fallback), torch.zeros(1, 6, 64, 64, dtype=torch.uint8)
     head = monitor.agent.encoder.forward
     monitor.agent.encoder.forward = lambda pixels: torch.full((len(pixels), 3), math.nan)
     found = monitor.step(pixels)
     assert bool(found.alarm)
     assert "nan" in found.reasons[0]
+    assert fallback == "policy" or not bool(found.action.any())
+    assert bool(monitor.step(None).action.isfinite().all())  # without a picture, as of an episode that begins
     monitor.agent.encoder.forward = head
     after = monitor.step(pixels)
     assert "nan" not in after.reasons[0]

@@ -55,21 +55,23 @@ class Memory:
         if self.begins is None or self.prior is None:
             self.prior = torch.zeros(n, self.agent.latent_dim, dtype=self.agent.gain.dtype, device=self.agent.gain.device)
             self.begins = torch.ones(n, dtype=torch.bool, device=self.agent.gain.device)
-        return self.prior, self.begins | ~self.prior.isfinite().all(1)  # from what is none no correction leads back
+        return self.prior, self.begins
 
     def unseen(self, n: int) -> Tensor:
         """Latents ``(n, p)`` where nothing is seen: what was expected. Nothing is remembered."""
         return within(self.expected(n)[0], direction_of(self.agent.dynamics))  # predictions of predictions drift off a circle, bit by bit
 
     def expect(self, predicted: Tensor, rows: Tensor | None = None) -> None:
-        """Predictions ``(n, p)`` for the next step, of all or of some of the episodes."""
+        """Predictions ``(n, p)`` for the next step, of all or of some of the episodes; one that is not finite is forgotten."""
         assert self.prior is not None
         assert self.begins is not None
+        lost = ~predicted.isfinite().all(1)  # from there no correction leads back
+        predicted = predicted.masked_fill(lost[:, None], 0.0)
         if rows is None:
-            self.prior, self.begins = predicted, torch.zeros_like(self.begins)
+            self.prior, self.begins = predicted, lost
         else:
             self.prior = self.prior.index_copy(0, rows, predicted[rows])
-            self.begins = self.begins.index_fill(0, rows, False)
+            self.begins = self.begins.index_copy(0, rows, lost[rows])
 
 
 def correction(agent: Any, held_error: float, seen: Tensor, expected: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -244,12 +246,12 @@ class Controller:
         latent, shape = self._last
         if action.shape != shape:
             raise ShapeError(f"expected actions {tuple(shape)}, received {tuple(action.shape)}")
+        if predicted is not None and predicted.shape != latent.shape:
+            raise ShapeError(f"expected latents {tuple(latent.shape)} after the actions, received {tuple(predicted.shape)}")
+        if not all(bool(given.isfinite().all()) for given in (action, predicted) if given is not None):
+            raise NonFiniteError("expected finite actions, and what follows them, received NaN or infinity; the memory stays as it was")
         if predicted is None:
             predicted = self.agent.dynamics(latent, action)
-        elif predicted.shape != latent.shape:
-            raise ShapeError(f"expected latents {tuple(latent.shape)} after the actions, received {tuple(predicted.shape)}")
-        if not bool(predicted.isfinite().all()):
-            raise NonFiniteError("expected finite actions, and what follows them, received NaN or infinity; the memory stays as it was")
         self._memory.expect(predicted, (~self.begins).nonzero()[:, 0])
 
 

@@ -257,7 +257,7 @@ class Monitor:
         """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told, and what a safety
         filter has found to follow ``(n, p)``; else that is computed.
 
-        A ConfigError before the first step, a ShapeError for actions or latents of another shape.
+        A ConfigError before the first step, a ShapeError for actions or latents of another shape, a NonFiniteError for NaN among them.
         """
         self._controller.took(action, predicted)
 
