@@ -204,8 +204,7 @@ class Union(Region):
 
     def shuffled(self, n: int, generator: torch.Generator | None = None, device: torch.device | str | None = None) -> Tensor:
         """Samples as of :meth:`sample`, not grouped."""
-        found = self.sample(n, generator, device)
-        return found[torch.randperm(n, generator=generator, device=device)]
+        return _permuted(self.sample(n, generator, device), generator)
 
     def _by_part(self, which: Tensor, generator: torch.Generator | None, device: torch.device | str | None) -> Tensor:
         return torch.cat([p.sample(int((which == k).sum()), generator, device) for k, p in enumerate(self.parts)])
@@ -233,7 +232,7 @@ class Mixture(Union):
         """Samples in the given shares."""
         which = torch.multinomial(self.shares.to(device or "cpu"), n, True, generator=generator) if n else torch.zeros(0)
         found = self._by_part(which, generator, device)
-        return found if self.grouped else found[torch.randperm(n, generator=generator, device=device)]
+        return found if self.grouped else _permuted(found, generator)
 
 
 def label(state: Tensor, safe: Region, unsafe: Region) -> Tensor:
@@ -265,6 +264,10 @@ def check_disjoint(safe: Region, unsafe: Region, n: int = 4096) -> None:
             f"expected disjoint safe and unsafe sets, received {shared[0]} of {n} safe samples in the unsafe set and "
             f"{shared[1]} of {n} unsafe samples in the safe set; change one of them"
         )
+
+
+def _permuted(states: Tensor, generator: torch.Generator | None) -> Tensor:
+    return states[torch.randperm(len(states), generator=generator, device=states.device)]
 
 
 def _check_states(state: Tensor, dim: int) -> None:

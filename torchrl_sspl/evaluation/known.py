@@ -302,8 +302,8 @@ def _from_the_set(run: _Run) -> None:
     start = states_where(run.inside, env.state_space, run.n, run.generator, draws=60 if "barrier" in out.arrays else 1)
     note = f"episodes of {horizon} steps from {{B<=0}}"
     if not len(start):
-        note = "{B<=0} is empty" if run.n else "no episodes were asked for"
-        note = note if "barrier" in out.arrays else "no barrier"
+        empty = "{B<=0} is empty" if run.n else "no episodes were asked for"
+        note = empty if "barrier" in out.arrays else "no barrier"
         for name in ("safe_rollouts_touch_unsafe", "safe_rollouts_leave"):
             out.add(share(name, 0, 0, note))
         out.missing("worst_next_barrier", unit="barrier", note=note)
