@@ -136,6 +136,7 @@ def test_an_error_of_any_kind_is_named_in_its_row_and_the_others_go_on(tmp_path,
     assert len(json.loads((tmp_path / "runs/baselines/rows.json").read_text())) == 1
 
 
+@pytest.mark.slow
 def test_a_signal_ends_the_processes_too(tmp_path):
     code = "import sys; from torchrl_sspl.baselines.__main__ import main; sys.exit(main(sys.argv[1:]))"
     words = ["table", "methods=" + ",".join(f"lqr:alpha=0.{k}" for k in range(1, 10)), "env=pendulum", "jobs=2"]

@@ -393,6 +393,7 @@ def test_rounding_of_the_barrier_counts_where_a_step_begins_and_where_it_ends():
     assert 0.25 - 1.5 * e - 1e-4 < real.delta <= 0.25 - 1.5 * e
 
 
+@pytest.mark.slow
 def test_shipped_pendulum_keeps_its_set_in_float32():
     agent = sspl.load("pendulum")
     parts = (agent.barrier, agent.dynamics, agent.policy)

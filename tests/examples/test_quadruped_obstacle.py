@@ -15,7 +15,7 @@ EXAMPLE = "quadruped_obstacle.py"
 LEFT_OUT = ("env=pendulum", "env.image_size=32", "network.pool_to=16")
 PICTURES = ["env.image_size=64", "network.pool_to=32"]
 # A coarse kernel: what is tested is the way to the report.
-SMALL = ["evaluation.grid=7", "evaluation.kernel_grid=31", "evaluation.episodes=4", "evaluation.horizon=2"]
+SMALL = ["synthesis.grid=9", "evaluation.grid=7", "evaluation.kernel_grid=31", "evaluation.episodes=4", "evaluation.horizon=2"]
 
 
 @pytest.fixture(scope="module")

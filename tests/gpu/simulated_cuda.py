@@ -23,7 +23,7 @@ def build(compiler: str, directory: Path) -> Path:
     library = directory / "libsimulated_cuda.so"
     include = [f"-I{torch / 'include'}", f"-I{torch / 'include' / 'torch' / 'csrc' / 'api' / 'include'}"]
     link = [f"-L{torch / 'lib'}", f"-Wl,-rpath,{torch / 'lib'}", "-lc10", "-ltorch_cpu"]
-    command = [compiler, "-std=c++20", "-O1", "-shared", "-fPIC", *include, str(SOURCE), "-o", str(library), *link]
+    command = [compiler, "-std=c++20", "-O0", "-shared", "-fPIC", *include, str(SOURCE), "-o", str(library), *link]
     result = subprocess.run(command, capture_output=True, text=True)
     if result.returncode:
         raise RuntimeError(f"{' '.join(command)}\n{result.stderr[-4000:]}")

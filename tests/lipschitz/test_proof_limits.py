@@ -304,7 +304,7 @@ def test_lmi_barrier_with_a_negative_slope_is_proved():
 # --- against exact elimination ----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=40, deadline=None, derandomize=True)
+@settings(max_examples=15, deadline=None, derandomize=True)
 @given(
     st.integers(0, 10**6),
     st.sampled_from([(1, 2, 1), (2, 3, 1), (2, 3, 3, 1)]),

@@ -24,15 +24,15 @@ def agent():
 @pytest.mark.parametrize("yaw_lag", [pytest.param(None, marks=pytest.mark.slow), YAW_LAG])
 def test_on_the_model_it_tells_the_labels_apart_and_stays_out_of_the_unsafe_set(agent, yaw_lag):
     env, generator = DubinsEnv(batch_size=[1], yaw_lag=yaw_lag), torch.Generator().manual_seed(411)
-    unsafe = env.sample_states(400, generator, region=env.unsafe_set)
-    safe = env.sample_states(400, generator, region=env.safe_set)
+    unsafe = env.sample_states(200, generator, region=env.unsafe_set)
+    safe = env.sample_states(200, generator, region=env.safe_set)
     assert bool((agent.barrier(encode_states(agent, env, unsafe)) > 0).all())
     outside = agent.barrier(encode_states(agent, env, safe)) > 0
     assert float(outside.float().mean()) <= agent.description["config"]["synthesis"]["safe_share"]
-    states = env.sample_states(400, generator, region=env.state_space - env.unsafe_set)
+    states = env.sample_states(200, generator, region=env.state_space - env.unsafe_set)
     inside = states[agent.barrier(encode_states(agent, env, states))[:, 0] <= 0]
-    assert len(inside) > 300
-    episodes = simulate(agent, env, start=inside, horizon=30)
+    assert len(inside) > 150
+    episodes = simulate(agent, env, start=inside, horizon=20)
     assert not bool(env.unsafe_set.contains(episodes.states).any())
 
 

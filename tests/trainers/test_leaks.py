@@ -108,10 +108,8 @@ def ends(running: Callable[[], list[int]], patience: float = 60.0, least: float 
     return True
 
 
-ENDS = ["an exception"] + [pytest.param(end, marks=pytest.mark.slow) for end in ("never begun", "Control-C", "the end", "killed")]
-
-
-@pytest.mark.parametrize("end", ENDS)
+@pytest.mark.slow
+@pytest.mark.parametrize("end", ["an exception", "never begun", "Control-C", "the end", "killed"])
 def test_collector_processes_and_temporary_files_are_gone_with_the_run(tmp_path, end):
     # In a folder with so long a name no socket can be made: workers would lose the first batch, and the trainer wait for it.
     mark, folder, script = uuid.uuid4().hex, tmp_path / "temporary".ljust(80, "-"), tmp_path / "run.py"

@@ -89,6 +89,7 @@ def test_wandb_stays_on_disk_without_a_key(tmp_path, figure, monkeypatch):
     assert "WANDB_MODE" not in __import__("os").environ
 
 
+@pytest.mark.slow
 def test_wandb_takes_a_figure_where_nobody_has_imported_pyplot(tmp_path):
     pytest.importorskip("wandb")
     pytest.importorskip("matplotlib")

@@ -17,6 +17,7 @@ def benchmark(monkeypatch):
     return importlib.import_module("trainer_overhead")
 
 
+@pytest.mark.slow
 def test_bare_loops_have_the_trainers_gradients(benchmark):
     table = benchmark.main(batch=24, image_size=32, latents=96, rows=1000, repeats=0)  # nothing is timed
     assert list(table) == PHASES
