@@ -92,14 +92,16 @@ def test_a_failure_is_filmed_from_a_start_that_is_claimed_until_it_is_in_u(tmp_p
 
 def test_cells_side_by_side_are_those_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    words = ["methods=lqr,cone", "env=pendulum", *SMALL]
+    words = ["methods=lqr,cone,latent_cbf:autoencoder_steps=1:steps=1", "env=pendulum", "budget=tiny", "score.shifted=0", *SMALL]
     rows = table(["jobs=2", *words])
-    assert [cell.method for cell, _ in rows] == ["lqr", "cone"]
-    (cell, row), (_, failed) = rows
+    assert [cell.method for cell, _ in rows] == ["lqr", "cone", "latent_cbf"]
+    (cell, row), (_, failed), (learnt, taught) = rows
     assert "expected a DubinsEnv" in failed
-    alone = run_cell(replace(cell, out_dir="alone"))
-    for name, measured in alone["measurements"].items():
-        assert "latency" in name or row["measurements"][name]["value"] == measured["value"]
+    for cell, row in ((cell, row), (learnt, taught)):
+        alone = run_cell(replace(cell, out_dir=f"alone/{cell.method}"))
+        assert (row["notes"], row["needs"]) == (alone["notes"], alone["needs"])
+        for name, measured in alone["measurements"].items():
+            assert "latency" in name or row["measurements"][name]["value"] == measured["value"]
     with pytest.raises(ConfigError, match="jobs >= 1, received run=true and jobs=0"):
         table(["jobs=0", *words])
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 import tempfile
 from multiprocessing import connection, current_process, util
 
@@ -159,6 +161,28 @@ def test_random_actions_go_on_where_they_were(env, before):
     other.load_state_dict(policy.state_dict())
     assert torch.equal(draw(policy), draw(other))
     assert torch.equal(draw(policy), draw(other))
+
+
+def test_random_actions_are_those_of_the_seed_whatever_process_makes_them(env, monkeypatch):
+    def draw(policy: RandomActions, *process: int) -> torch.Tensor:
+        monkeypatch.setattr(current_process(), "_identity", process)
+        return policy(TensorDict(batch_size=[8]))["action"]
+
+    drawn, workers = [], []
+    for home in ((), (1,), (2,)):
+        monkeypatch.setattr(current_process(), "_identity", home)
+        policy = RandomActions(env, 5)
+        sent = pickle.dumps(policy)
+        workers.append([draw(kind(sent), *home, k) for k in (1, 2) for kind in (pickle.loads, lambda body: copy.deepcopy(pickle.loads(body)))])
+        drawn.append(draw(policy, *home))
+    expected = torch.Generator().manual_seed(5), torch.Generator().manual_seed(5 + 1_000_003)
+    alone, first = (-10 + torch.rand(8, 1, generator=generator) * 20 for generator in expected)
+    for own, of_workers in zip(drawn, workers, strict=True):
+        assert torch.equal(own, alone)
+        assert torch.equal(of_workers[0], first)
+        assert torch.equal(of_workers[0], of_workers[1])
+        assert torch.equal(of_workers[2], of_workers[3])
+        assert not torch.equal(of_workers[0], of_workers[2])
 
 
 @pytest.fixture

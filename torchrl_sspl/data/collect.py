@@ -33,10 +33,16 @@ _EPISODE = 64  # steps up to which no episode is cut
 _SOCKET = 103  # bytes of the longest name of a socket that macOS takes; Linux takes 107
 
 
+def _worker() -> int:
+    """Number of this process among those that its parent has begun, on top of the parent's own; 0 of a main one."""
+    return sum(multiprocessing.current_process()._identity)  # type: ignore[attr-defined]
+
+
 class RandomActions(TensorDictModuleBase):
     """Policy that draws actions uniformly from the bounds of an environment, with a random generator of its own.
 
-    Without a seed it draws others every time. Source: paper Section IV-D.
+    Without a seed it draws others every time. Workers of a collector, which get copies, draw actions of their own; whichever process
+    makes the policy, it draws the same. Source: paper Section IV-D.
     """
 
     def __init__(self, env: EnvBase, seed: int | None = None) -> None:
@@ -46,6 +52,7 @@ class RandomActions(TensorDictModuleBase):
         space = env.action_spec_unbatched.space
         self._low, self._high, self._seed = space.low, space.high, seed
         self._generator: torch.Generator | None = None
+        self._home = _worker()  # copies carry it along
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``"action"`` ``(*batch, action_dim)``."""
@@ -54,9 +61,7 @@ class RandomActions(TensorDictModuleBase):
             if self._seed is None:
                 self._generator.seed()
             else:
-                # Workers of a collector get copies of this policy: each draws actions of its own.
-                worker = sum(multiprocessing.current_process()._identity)  # type: ignore[attr-defined]
-                self._generator.manual_seed(self._seed + 1_000_003 * worker)
+                self._generator.manual_seed(self._seed + 1_000_003 * (_worker() - self._home))
         shape = (*tensordict.batch_size, *self._low.shape)
         unit = torch.rand(shape, generator=self._generator, device=self._low.device)
         return tensordict.set("action", self._low + unit * (self._high - self._low))
