@@ -10,7 +10,7 @@ import torch
 from torchrl_sspl.baselines import make, scoring
 from torchrl_sspl.baselines.__main__ import main
 from torchrl_sspl.baselines.base import BUDGETS, Budget, Needs
-from torchrl_sspl.baselines.cell import ROW_FILE, Cell, run_cell, stored, text
+from torchrl_sspl.baselines.cell import ROW_FILE, SCHEMA, Cell, run_cell, stored, text
 from torchrl_sspl.baselines.data import pooled, record
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, OutputError, ShapeError
@@ -49,11 +49,29 @@ def test_a_row_of_an_agent_with_other_weights_is_measured_again(tmp_path):
     agent.save(tmp_path / "agent")
     cell = Cell.of("sspl", [f"agent={tmp_path / 'agent'}", f"out_dir={tmp_path}/row", *SMALL])
     cell.directory.mkdir()
-    (cell.directory / ROW_FILE).write_text(json.dumps({"cell": cell.describe()}))
+    (cell.directory / ROW_FILE).write_text(json.dumps({"schema": SCHEMA, "cell": cell.describe()}))
     assert stored(cell) is not None
     agent.barrier[-1].bias.data += 1.0
     agent.save(tmp_path / "agent")
     assert stored(cell) is None
+
+
+def test_a_row_of_another_version_is_not_taken(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    words = ["env=pendulum", *SMALL]
+    path = Cell.of("lqr", words).directory / ROW_FILE
+    body = run_cell(Cell.of("lqr", words))
+    assert stored(Cell.of("lqr", words)) == body
+    for schema in (SCHEMA - 1, None):
+        path.write_text(json.dumps(body | {"schema": schema}))
+        with pytest.raises(OutputError, match=rf"expected measurements of schema {SCHEMA} in '.*row\.json', found those of schema {schema}, of another version"):
+            run_cell(Cell.of("lqr", words))
+    assert main(["table", "methods=lqr", "run=false", *words]) == 0
+    told = capsys.readouterr()
+    assert "| lqr | none | OutputError: expected measurements of schema" in told.out
+    assert "left out: expected measurements of schema" in told.err
+    assert json.loads((tmp_path / "runs/baselines/rows.json").read_text()) == []
+    assert "Claimed sets" not in (tmp_path / "runs/baselines/table.html").read_text()
 
 
 @pytest.mark.parametrize(

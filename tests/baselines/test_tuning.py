@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchrl_sspl.baselines import BUDGETS, make, record
-from torchrl_sspl.baselines.cell import TRIALS_FILE, Cell, run_cell
+from torchrl_sspl.baselines.cell import SCHEMA, TRIALS_FILE, Cell, run_cell
 from torchrl_sspl.baselines.registry import METHODS, kind_of
 from torchrl_sspl.baselines.tuning import SEED, draws, merit, search
 from torchrl_sspl.envs import PendulumEnv
@@ -140,6 +140,9 @@ def test_the_choice_is_made_once_for_all_seeds_and_stands_in_the_row(tmp_path, m
     path.write_text(json.dumps(told))  # of another space: the defaults alone are the same
     trials = run_cell(Cell.of("nerf_cbf", ["seed=4", *words]))["tuning"]["trials"]
     assert sorted(t["options"] for t in trials) == [[], ["beta=7.0"], ["beta=8.0"]]
+    path.write_text(json.dumps(told | {"schema": SCHEMA - 1}))
+    with pytest.raises(OutputError, match=r"expected measurements of schema .* in '.*trials\.json', found those of schema"):
+        run_cell(Cell.of("nerf_cbf", ["seed=3", *words]))
     path.write_text("{")
     with pytest.raises(OutputError, match=r"trials in '.*', received what cannot be read"):
         run_cell(Cell.of("nerf_cbf", ["seed=3", *words]))

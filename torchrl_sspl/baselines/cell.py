@@ -34,7 +34,7 @@ from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
 ROW_FILE, CLAIMS_FILE, TRIALS_FILE = "row.json", "claims.npz", "trials.json"
 STAYS = "rows and trials that are done stay; the same command goes on from there"
-SCHEMA = 1
+SCHEMA = 2  # one more where recordings, encoders or measures have changed: what was measured before is not taken
 _OWN = ("env", "budget", "seed", "out_dir", "trials")
 
 
@@ -130,7 +130,7 @@ def trained_before(options: Sequence[str]) -> bool:
 
 
 def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
-    """The row of a cell, if it has been written, of an agent with the same weights; OutputError if the directory holds another one.
+    """The row of a cell, if it has been written, of an agent with the same weights; OutputError if the directory holds another one, or one of another version.
 
     With ``any_score`` the sizes of its measurement do not matter. Source: none.
 
@@ -141,13 +141,28 @@ def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
     path = cell.directory / ROW_FILE
     if not path.is_file():
         return None
-    row = _read(path, "a row")
+    row = of_this_version(_read(path, "a row"), path)
     found = row.get("cell") or {}
     if found.get("weights") != cell.describe().get("weights"):
         return None
     if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
         raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; remove it, or choose another out_dir for one row")
     return row
+
+
+def of_this_version(body: dict[str, Any], path: Path) -> dict[str, Any]:
+    """What a file of a row or of trials holds; OutputError if it was measured by a version with other recordings or encoders. Source: none.
+
+    Example:
+        >>> of_this_version({"schema": SCHEMA, "trials": []}, Path("trials.json"))["trials"]
+        []
+    """
+    if body.get("schema") != SCHEMA:
+        raise OutputError(
+            f"expected measurements of schema {SCHEMA} in '{path}', found those of schema {body.get('schema')}, of another version of this library, "
+            "whose recordings or encoders may differ; remove the file, or move it elsewhere to keep it, and what is missing is measured again"
+        )
+    return body
 
 
 def _read(path: Path, what: str) -> dict[str, Any]:
@@ -204,17 +219,17 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
 
     path.parent.mkdir(parents=True, exist_ok=True)
     with FileLock(path.with_name(f".{TRIALS_FILE}.lock")):  # another seed waits for them
-        return tuning.search(trial, options, _told(path, asked, options), lambda so_far: write(path, json.dumps({"of": asked, "trials": so_far}, indent=1) + "\n"))
+        return tuning.search(trial, options, _told(path, asked, options), lambda so_far: write(path, json.dumps({"schema": SCHEMA, "of": asked, "trials": so_far}, indent=1) + "\n"))
 
 
 def _told(path: Path, asked: dict[str, Any], options: Sequence[Sequence[str]]) -> list[dict[str, Any]]:
     """The trials that an earlier call has made, as far as they are those of these options: a space may have changed since.
 
-    An OutputError if they were made in episodes of another length: rows of one method would carry different options.
+    An OutputError if they were made in episodes of another length, or by another version: rows of one method would carry different options.
     """
     if not path.is_file():
         return []
-    found = _read(path, "trials")
+    found = of_this_version(_read(path, "trials"), path)
     of, horizon = found.get("of") or {}, asked["horizon"]
     if of != asked and {**of, "horizon": horizon} == asked:
         raise OutputError(f"expected trials in episodes of {horizon} steps in '{path}', found those of {of['horizon']}; give score.horizon={of['horizon']}, or remove the file")

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell
+from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell, of_this_version
 from torchrl_sspl.baselines.scoring import NOMINALS
 from torchrl_sspl.baselines.table import Row, budget_of, markdown, name_of, table, tables
-from torchrl_sspl.errors import MissingDependencyError
+from torchrl_sspl.errors import MissingDependencyError, OutputError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.animation import Scene, Take, animate
 from torchrl_sspl.viz.pages import Table, render
@@ -41,9 +41,11 @@ def main(words: Sequence[str]) -> int:
     every = []
     for path in sorted(DIRECTORY.rglob(ROW_FILE)):
         try:
-            every.append(json.loads(path.read_text()))
+            every.append(of_this_version(json.loads(path.read_text()), path))
         except ValueError as error:
             print(f"left out: '{path}' cannot be read ({error}); remove it", file=sys.stderr)
+        except OutputError as error:
+            print(f"left out: {error}", file=sys.stderr)
     write(DIRECTORY / "rows.json", json.dumps(every, indent=1) + "\n")
     try:
         page(rows, DIRECTORY / "table.html")
@@ -59,7 +61,7 @@ def page(rows: Sequence[tuple[Cell, Row]], path: str | Path) -> Path:
     """
     found, path = [], Path(path)
     for env, of_env in tables(rows).items():
-        cells = [cell for cell, _ in rows if cell.env == env]
+        cells = [cell for cell, row in rows if cell.env == env and isinstance(row, dict)]  # what lies beside another row is another one's
         drawn, film = claims(cells), failures(cells, path.with_name(f"failures-{Path(env).stem}.mp4"))
         figures = [] if drawn is None else [figure_picture(f"Claimed sets, {env}", drawn)]
         if film is not None:
