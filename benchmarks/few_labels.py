@@ -34,7 +34,7 @@ import numpy as np
 import torch
 
 from torchrl_sspl.baselines import Budget, Needs, ScoreConfig, make, score
-from torchrl_sspl.baselines.cell import Cell
+from torchrl_sspl.baselines.cell import Cell, folder_of, hash_of
 from torchrl_sspl.baselines.sspl import SSPL, needs_of, recorded_first
 from torchrl_sspl.configs.reader import compose, parse
 from torchrl_sspl.errors import ConfigError
@@ -110,15 +110,18 @@ class Point:
         other = [*self.options, *([] if self.starts == Point.starts else [str(self.starts)])]
         if other:
             name += f"-{sha256(' '.join(other).encode()).hexdigest()[:8]}"
-        return Path(self.env) / name / str(self.seed) / "point.json"
+        return Path(folder_of(self.env)) / name / str(self.seed) / "point.json"
 
     def measure(self, path: Path, sizes: ScoreConfig) -> dict[str, Any]:
         """Train and score, or read what has been measured with the same sizes."""
+        system = hash_of(self.env)
         with RunDirectory(path.parent).held() as directory:
             if path.is_file():
                 row = json.loads(path.read_text())
                 if row.get("score") != asdict(sizes):
                     raise ConfigError(f"score: expected {row.get('score')}, with which '{path}' was measured, received {asdict(sizes)}; give the same, or remove the point")
+                if row.get("system", "") != system:
+                    raise ConfigError(f"env: expected '{self.env}' as it was when '{path}' was measured, received another content; remove the point, or give another out=")
                 return row
             few = [] if self.labels == "all" else [f"labels.safe={self.labels}", f"labels.unsafe={self.labels}"]
             words = [f"labels.wrong={self.wrong}", *few, *self.options]
@@ -127,6 +130,8 @@ class Point:
                 "score": asdict(sizes), "passed": float(any(check.passed for check in checks)), "checks": [asdict(check) for check in checks],
                 "needs": asdict(needs), "measurements": found,
             }  # fmt: skip
+            if system:
+                row["system"] = system
             write(path, json.dumps(row, indent=1) + "\n")
             return row
 

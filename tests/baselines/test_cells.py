@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,8 +11,9 @@ import torch
 from torchrl_sspl.baselines import make, scoring
 from torchrl_sspl.baselines.__main__ import main
 from torchrl_sspl.baselines.base import BUDGETS, Budget, Needs
-from torchrl_sspl.baselines.cell import ROW_FILE, SCHEMA, Cell, run_cell, stored, text
+from torchrl_sspl.baselines.cell import ROW_FILE, SCHEMA, TRIALS_FILE, Cell, _tuned, run_cell, stored, text
 from torchrl_sspl.baselines.data import pooled, record
+from torchrl_sspl.configs.reader import FOLDER
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, OutputError, ShapeError
 from torchrl_sspl.modules.agent import load
@@ -72,6 +74,29 @@ def test_a_row_of_another_version_is_not_taken(tmp_path, monkeypatch, capsys):
     assert "left out: expected measurements of schema" in told.err
     assert json.loads((tmp_path / "runs/baselines/rows.json").read_text()) == []
     assert "Claimed sets" not in (tmp_path / "runs/baselines/table.html").read_text()
+
+
+def test_a_row_of_a_file_is_that_of_its_content(tmp_path, monkeypatch):
+    folder = tmp_path / "work"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    usual = (FOLDER / "env" / "pendulum.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(usual)
+    cell = Cell.of("lqr", ["env=../mine.yaml", *SMALL])
+    assert cell.directory.as_posix() == "runs/baselines/up/mine.yaml/none/lqr/0"
+    row = run_cell(cell)
+    (tmp_path / "mine.yaml").write_text(f"{usual}\n# of no account\n")
+    assert run_cell(cell) == row
+    (tmp_path / "mine.yaml").write_text(usual.replace("max_torque: 10.0", "max_torque: 4.0"))
+    monkeypatch.setattr("torchrl_sspl.baselines.tuning.search", lambda trial, options, told, keep: keep([]))
+    tried = replace(cell, method="latent_cbf", budget="tiny", trials=1)
+    _tuned(tried)
+    assert json.loads((tried.directory.parent / TRIALS_FILE).read_text())["of"]["system"] == cell.describe()["system"] != row["cell"]["system"]
+    with pytest.raises(OutputError, match=r"expected the row of '\.\./mine\.yaml' as it is in '.*', found that of an earlier content of the file"):
+        run_cell(cell)
+    anew = run_cell(replace(cell, out_dir="anew"))
+    assert anew["measurements"]["claimed_over_kernel"]["value"] != row["measurements"]["claimed_over_kernel"]["value"]
+    assert "system" not in Cell.of("lqr", SMALL).describe()
 
 
 @pytest.mark.parametrize(

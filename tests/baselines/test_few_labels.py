@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import pytest
 from tiny import TINY_PHASES
 
+from torchrl_sspl.baselines import Needs, ScoreConfig
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.measurements import Evaluation, share
@@ -167,6 +168,20 @@ def test_the_quadruped_is_a_run_with_settings_of_its_own(tmp_path, monkeypatch, 
     assert len(asked) == 1  # a point that has been measured is read
     with pytest.raises(ConfigError, match="starts: expected none with env=quadruped"):
         start(monkeypatch, *words, "starts=[0,0.5,0.5]")
+
+
+def test_a_point_of_a_file_is_that_of_its_content(tmp_path, monkeypatch):
+    own = tmp_path / "mine.yaml"
+    own.write_text("env: {_target_: torchrl_sspl.envs.PendulumEnv}\n")
+    made = runpy.run_path(str(BENCHMARK))
+    point, path = made["Point"](str(own), "20", 640, 0.0, 0, ()), tmp_path / "point.json"
+    monkeypatch.setattr(made["Point"], "_row", lambda *of: ([], Needs(), {}))
+    row = point.measure(path, ScoreConfig())
+    assert point.measure(path, ScoreConfig()) == json.loads(json.dumps(row))
+    own.write_text("env: {_target_: torchrl_sspl.envs.PendulumEnv, max_torque: 4.0}\n")
+    with pytest.raises(ConfigError, match=r"env: expected '.*mine\.yaml' as it was when '.*point\.json' was measured, received another content"):
+        point.measure(path, ScoreConfig())
+    assert made["Point"]("../mine.yaml", "20", 640, 0.0, 0, ()).path.parts[:2] == ("up", "mine.yaml")
 
 
 @pytest.mark.slow

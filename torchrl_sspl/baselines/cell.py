@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import yaml
 from filelock import FileLock
 
 from torchrl_sspl.baselines import tuning
@@ -24,7 +25,7 @@ from torchrl_sspl.baselines.data import Recording, record
 from torchrl_sspl.baselines.pictures import Album
 from torchrl_sspl.baselines.registry import changed, kind_of, make
 from torchrl_sspl.baselines.scoring import ScoreConfig, score, sizes_of
-from torchrl_sspl.configs.reader import EnvFactory, compose, parse
+from torchrl_sspl.configs.reader import ENVS, EnvFactory, compose, parse
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, OutputError
 from torchrl_sspl.files import RunDirectory, write
@@ -44,7 +45,7 @@ class Cell:
 
     Attributes:
         method: name in ``METHODS``.
-        env: name of a system of this library, such as ``"pendulum"`` or ``"dubins"``.
+        env: name of a system of this library, such as ``"pendulum"`` or ``"dubins"``, or a file of your own.
         budget: name in ``BUDGETS``.
         seed: of data, weights and batches.
         options: ``key=value`` changes of the method's configuration.
@@ -98,7 +99,7 @@ class Cell:
     def directory(self) -> Path:
         """Where the row lies: ``out_dir``, or one that names what determines it."""
         name = "-".join([self.method, *(o.replace("=", "-").replace("/", "_") for o in self.options), *([f"trials-{self.trials}"] if self.trials else [])])
-        return Path(self.out_dir or f"runs/baselines/{self.env}/{self.budget}/{name}/{self.seed}")
+        return Path(self.out_dir or f"runs/baselines/{folder_of(self.env)}/{self.budget}/{name}/{self.seed}")
 
     def describe(self) -> dict[str, Any]:
         """Plain values that determine the row; where it lies is not among them."""
@@ -107,6 +108,8 @@ class Cell:
         if not self.trials:
             body.pop("trials")
         body["options"] = list(self.options)
+        if system := hash_of(self.env):
+            body["system"] = system
         for agent in (o.removeprefix("agent=") for o in self.options if o.startswith("agent=")):
             body["weights"] = sha256((agent_directory(agent) / WEIGHTS_FILE).read_bytes()).hexdigest()
         return body
@@ -117,6 +120,32 @@ class Cell:
         if not isinstance(env, SafetyEnv) or env.known_twin() is not env:
             raise ConfigError(f"env: expected a system whose true kernel is known, such as pendulum or dubins, received '{self.env}'")
         return env
+
+
+def folder_of(env: str) -> str:
+    """A system's name, or its file's, as a folder below another one: without the steps up of a path. Source: none.
+
+    Example:
+        >>> folder_of("pendulum"), folder_of("../mine/car.yaml")
+        ('pendulum', 'up/mine/car.yaml')
+    """
+    path = Path(env)
+    return "/".join("up" if part == ".." else part for part in path.parts if part != path.anchor)
+
+
+def hash_of(env: str) -> str:
+    """A hash of what a file of your own says of a system, 16 digits; "" of a system of this library, which the schema tells.
+
+    Raises ConfigError if there is no such system. Source: none.
+
+    Example:
+        >>> hash_of("pendulum")
+        ''
+    """
+    if env in ENVS:
+        return ""
+    compose([f"env={env}"])  # names what is not valid
+    return sha256(json.dumps(yaml.safe_load(Path(env).read_text()), sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
 def trained_before(options: Sequence[str]) -> bool:
@@ -145,6 +174,8 @@ def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
     found = row.get("cell") or {}
     if found.get("weights") != cell.describe().get("weights"):
         return None
+    if found.get("system") != (now := cell.describe().get("system")) and {**found, "system": now} == cell.describe():
+        raise OutputError(f"expected the row of '{cell.env}' as it is in '{path}', found that of an earlier content of the file; remove it, or choose another out_dir")
     if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
         raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; remove it, or choose another out_dir for one row")
     return row
@@ -173,27 +204,27 @@ def _read(path: Path, what: str) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=1)
-def _recorded(env: str, budget: str, seed: int) -> Recording:
-    """One recording serves all methods of a system, a budget and a seed."""
+def _recorded(env: str, system: str, budget: str, seed: int) -> Recording:
+    """One recording serves all methods of a system, a budget and a seed; ``system`` is the hash of its file."""
     return record(Cell("kernel", env, seed=seed).environment(), BUDGETS[budget], seed)
 
 
 @functools.lru_cache(maxsize=2)
-def _kernel(env: str, nodes: int) -> ViabilityKernel:
+def _kernel(env: str, system: str, nodes: int) -> ViabilityKernel:
     """One true kernel serves all methods of a system."""
     made = Cell("kernel", env).environment()
     return viability_kernel(made, resolution=sizes_of(made.system.kernel_grid, nodes))
 
 
 @functools.lru_cache(maxsize=1)
-def _album(env: str) -> Album:
+def _album(env: str, system: str) -> Album:
     """Pictures that all methods of a system are asked about."""
     return Album(Cell("kernel", env).environment())
 
 
 def _fit(method: SafetyMethod, env: SafetyEnv, cell: Cell, seed: int) -> None:
     """The method of a cell learns from the data of a seed."""
-    data = _recorded(cell.env, cell.budget, seed) if method.learns and method.records else None
+    data = _recorded(cell.env, hash_of(cell.env), cell.budget, seed) if method.learns and method.records else None
     with torch.random.fork_rng():
         torch.manual_seed(spawn(seed, "weights"))
         method.fit(data, env, BUDGETS.get(cell.budget, BUDGETS["tiny"]), seed)
@@ -205,7 +236,7 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
     horizon = cell.score.horizon or 60
     asked = {
         "method": cell.method, "env": cell.env, "budget": cell.budget, "options": list(cell.options), "trials": cell.trials, "horizon": horizon,
-    }  # fmt: skip
+    } | ({"system": system} if (system := hash_of(cell.env)) else {})  # fmt: skip
     # An option that names the row is not drawn.
     options = tuning.draws(cell.method, cell.trials, named=[option.partition("=")[0] for option in cell.options])
     env, stages = replace(cell, seed=tuning.SEED).environment(), dict[tuple[str, ...], Any]()
@@ -254,23 +285,23 @@ def run_cell(cell: Cell) -> dict[str, Any]:
             return row
         from torchrl_sspl import __version__
 
-        env = cell.environment()
+        env, system, determined = cell.environment(), hash_of(cell.env), cell.describe()  # before anything is changed meanwhile
         chosen, trials = _tuned(cell) if cell.trials else ((), [])
         method = make(cell.method, [*cell.options, *chosen])
         method.directory, method.env_name = directory, cell.env
         clock = [time.perf_counter()]
         if method.learns and method.records:
-            _recorded(cell.env, cell.budget, cell.seed)
+            _recorded(cell.env, system, cell.budget, cell.seed)
         clock.append(time.perf_counter())
         used = time.process_time()
         _fit(method, env, cell, cell.seed)
         used = time.process_time() - used
         clock.append(time.perf_counter())
-        found = score(method, env, cell.score, kernel=_kernel(cell.env, cell.score.kernel_grid), album=_album(cell.env))
+        found = score(method, env, cell.score, kernel=_kernel(cell.env, system, cell.score.kernel_grid), album=_album(cell.env, system))
         clock.append(time.perf_counter())
         minutes = {name: (b - a) / 60 for name, a, b in zip(("data", "fit", "score"), clock, clock[1:], strict=False)}
         row = {
-            "schema": SCHEMA, "version": __version__, "cell": cell.describe(), "needs": asdict(method.needs),
+            "schema": SCHEMA, "version": __version__, "cell": determined, "needs": asdict(method.needs),
             "minutes": minutes | {"fit_cpu": used / 60} | _of_trials(trials), "measurements": found.to_dict(), "notes": method.notes,
         }  # fmt: skip
         if cell.trials:
