@@ -95,9 +95,8 @@ def test_cells_side_by_side_are_those_one_after_the_other(tmp_path, monkeypatch)
     words = ["methods=lqr,cone,latent_cbf:autoencoder_steps=1:steps=1", "env=pendulum", "budget=tiny", "score.shifted=0", *SMALL]
     rows = table(["jobs=2", *words])
     assert [cell.method for cell, _ in rows] == ["lqr", "cone", "latent_cbf"]
-    (cell, row), (_, failed), (learnt, taught) = rows
-    assert "expected a DubinsEnv" in failed
-    for cell, row in ((cell, row), (learnt, taught)):
+    assert "expected a DubinsEnv" in rows[1][1]
+    for cell, row in rows[::2]:
         alone = run_cell(replace(cell, out_dir=f"alone/{cell.method}"))
         assert (row["notes"], row["needs"]) == (alone["notes"], alone["needs"])
         for name, measured in alone["measurements"].items():

@@ -11,6 +11,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
+from torchrl.envs import DoubleToFloat, DTypeCastTransform, SerialEnv, TransformedEnv
 
 from torchrl_sspl.data import TransitionStore, collect, collect_random, collect_rollouts
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions
@@ -62,6 +63,15 @@ def test_episodes_start_in_the_region_and_the_environment_is_left_as_it_was(env)
     assert store.n_frames == 300  # independent transitions share no frame
     assert env.initial_set is before
     assert len(env.rollout(2)) == 8  # it still runs
+
+
+def test_episodes_of_a_transformed_environment_start_in_the_region(env):
+    before, changed = env.initial_set, TransformedEnv(TransformedEnv(env, DTypeCastTransform(torch.uint8, torch.uint8, in_keys=["pixels"])), DoubleToFloat(), auto_unwrap=False)
+    for collected in (collect_random(changed, 100, seed=0, steps=1, region=env.safe_set), collect_rollouts(changed, RandomActions(env), 40, steps=1, region=env.safe_set)):
+        assert (collected.get(slice(None))["region"] == SAFE).all()
+    assert env.initial_set is before
+    with pytest.raises(ConfigError, match=r"region: expected a SafetyEnv, with transforms or without.*received SerialEnv; leave region out"):
+        collect_random(SerialEnv(1, _small_environment), 10, region=env.safe_set)
 
 
 def test_episodes_are_no_longer_than_asked(env):

@@ -21,9 +21,10 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.collectors import BaseCollector, Collector
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
 
 from torchrl_sspl.data.store import TransitionStore, without_padding
+from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.sets import Region
 
@@ -169,14 +170,15 @@ def collect_rollouts(
         n: number of transitions.
         seed: seed of states and actions; with the direct backend the result is then the same every time.
         steps: longest episode; 1 gives independent transitions. Default: until the environment ends it.
-        region: set from which episodes start, such as ``env.safe_set``. Default: the environment's ``initial_set``.
+        region: set from which episodes of a :class:`~torchrl_sspl.envs.SafetyEnv`, with transforms or without, start, such as
+            ``env.safe_set``. Default: the environment's ``initial_set``.
         store: store to add to. Default: a new one of capacity n.
         keep_state: keep true states in a new store, for evaluation.
         **collector: arguments of ``torchrl.collectors.Collector``, such as ``backend`` (``"direct"``),
             ``num_collectors``.
 
     Returns the store with n more transitions. Raises ConfigError if ``n`` or ``steps`` is not positive, or ``region``
-    is given with a function. Source: Algorithm 1 of the paper (rollouts of the policy join D). Deviation: none.
+    is given with a function or an environment that is no SafetyEnv. Source: Algorithm 1 of the paper (rollouts of the policy join D). Deviation: none.
 
     Example:
         >>> from torchrl_sspl.envs import PendulumEnv
@@ -351,15 +353,23 @@ def _ray_collector(makers: list[Any], policy: TensorDictModuleBase, address: str
 
 @contextlib.contextmanager
 def _starting_in(env: Any, region: Region | None) -> Iterator[None]:
-    """Let episodes of the environment start in a region meanwhile."""
+    """Let episodes of the environment, of which transforms may be made, start in a region meanwhile."""
     if region is None:
         yield
         return
-    before, env.initial_set = env.initial_set, region
+    inner = env
+    while isinstance(inner, TransformedEnv):
+        inner = inner.base_env
+    if not isinstance(inner, SafetyEnv):
+        raise ConfigError(
+            f"region: expected a SafetyEnv, with transforms or without, whose episodes start where they are asked to, received {type(inner).__name__}; "
+            "leave region out, and start the environment there yourself"
+        )
+    before, inner.initial_set = inner.initial_set, region
     try:
         yield
     finally:
-        env.initial_set = before
+        inner.initial_set = before
 
 
 __all__ = ["BACKENDS", "ExploringPolicy", "RandomActions", "collect_random", "collect_rollouts", "make_collector"]
