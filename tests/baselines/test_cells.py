@@ -154,6 +154,20 @@ def test_as_many_episodes_place_the_level_as_were_asked_for_under_both_nominal_p
     assert blocks == [(10, False), (10, True), (n // 2, False), (n // 2, True), (10, False), (10, True)]
 
 
+def test_methods_on_states_and_on_pictures_are_measured_alike(monkeypatch):
+    seen = []
+
+    def look(it):
+        seen.append((it.config.episodes, it.config.horizon, it.config.check_episodes))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(scoring, "_sets", look)
+    for name in ("lqr", "latent_cbf"):
+        with pytest.raises(KeyboardInterrupt):
+            scoring.score(make(name), PendulumEnv(), kernel=object())
+    assert seen == [(500, 200, 500)] * 2
+
+
 def test_budgets_are_those_of_the_protocol():
     assert BUDGETS["small"].total == 23_000
     assert BUDGETS["full"].total == 115_000

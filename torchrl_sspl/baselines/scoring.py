@@ -25,6 +25,7 @@ from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
 _RIM = 2  # cells of the kernel's grid that the common set keeps from its border
 _ENTER = 0.001  # share of the check episodes that may enter U at a calibrated level
+_EPISODES, _HORIZON = 500, 200  # of every method: columns of one table are alike
 NOMINALS = ("harmless", "adversarial")
 CLAIMS = ("claimed_over_kernel", "false_safe", "unsafe_called_safe")
 
@@ -33,8 +34,8 @@ CLAIMS = ("claimed_over_kernel", "false_safe", "unsafe_called_safe")
 class ScoreConfig:
     """Sizes of the measurements."""
 
-    episodes: int = 0  # of each of the four blocks; 0: 10,000 of a method on states, 500 of one on pictures
-    horizon: int = 0  # steps of each; 0: 200 of a method on states, 100 of one on pictures
+    episodes: int = 0  # of each of the four blocks; 0: 500, of methods on states and on pictures alike
+    horizon: int = 0  # steps of each; 0: 200
     grid: int = 0  # states along the finest coordinate of the grid of the sets; 0: the system's own
     kernel_grid: int = 0  # the same of the true kernel's grid
     check_episodes: int = 0  # that place a calibrated level; 0: as many as episodes
@@ -224,9 +225,9 @@ def score(
     given = config or ScoreConfig()
     given.check()
     on_states = method.reads == "state"
-    episodes = given.episodes or (10_000 if on_states else 500)
+    episodes = given.episodes or _EPISODES
     sizes = ScoreConfig(
-        episodes, given.horizon or (200 if on_states else 100), given.grid, given.kernel_grid,
+        episodes, given.horizon or _HORIZON, given.grid, given.kernel_grid,
         given.check_episodes or episodes, given.frames, given.shifted, given.seed,
     )  # fmt: skip
     if kernel is None:
