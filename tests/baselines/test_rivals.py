@@ -23,9 +23,11 @@ from torchrl_sspl.baselines.scoring import adversarial, harmless, nominals, well
 from torchrl_sspl.baselines.sspl import settings
 from torchrl_sspl.baselines.vision_cbf import Geometry
 from torchrl_sspl.configs import compose, reader
+from torchrl_sspl.data import collect_random
 from torchrl_sspl.envs import CMUDubinsEnv, CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation import simulate
+from torchrl_sspl.evaluation.measurements import Evaluation
 from torchrl_sspl.experiments import Experiment
 from torchrl_sspl.viability import viability_kernel
 
@@ -187,6 +189,30 @@ def test_its_own_training_takes_the_budget_and_no_rollouts(tmp_path, systems):
     assert method.needs.rollouts == 0
     assert (tmp_path / "run" / "agent" / "agent.json").is_file()
     assert method.act(env.observe(torch.zeros(2, 2)), torch.zeros(2, 1))[0].shape == (2, 1)
+
+
+def test_a_training_that_goes_on_counts_the_cpu_time_of_all_its_processes(tmp_path, monkeypatch):
+    """And its ledger what its store holds, where no phase has counted that."""
+    clock, stops = [0.0], [True, False]
+
+    class Half(Experiment):
+        def train(self, **options):
+            clock[0] += 60.0
+            if stops.pop(0):
+                raise KeyboardInterrupt
+            collect_random(self.env, 24, seed=0, store=self.store)
+            return self.agent()
+
+    monkeypatch.setattr("torchrl_sspl.baselines.sspl.Experiment", Half)
+    monkeypatch.setattr("time.process_time", lambda: clock[0])
+    for name, found in (("_kernel", None), ("_album", None), ("score", Evaluation())):
+        monkeypatch.setattr(f"torchrl_sspl.baselines.cell.{name}", lambda *of, found=found, **more: found)
+    cell = Cell.of("sspl", ["budget=tiny", "overrides=[synthesis.enabled=false]", f"out_dir={tmp_path / 'row'}"])
+    with pytest.raises(KeyboardInterrupt):
+        run_cell(cell)
+    row = run_cell(cell)
+    assert row["minutes"]["fit_cpu"] == 2.0
+    assert row["needs"]["transitions"] == 24
 
 
 def test_its_own_training_is_of_the_system_that_is_scored(tmp_path, monkeypatch):

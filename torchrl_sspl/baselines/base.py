@@ -49,6 +49,7 @@ class Budget:
         return self.transitions + self.safe + self.unsafe + self.rollouts
 
 
+EARLIER = "earlier_cpu_seconds"  # note of a method whose training goes on where another process stopped
 #: Small: one recording. Full: more than the shipped agents took, with rollouts. Tiny: for tests.
 BUDGETS = {
     "tiny": Budget("tiny", 96, 32, 32),

@@ -20,7 +20,7 @@ import yaml
 from filelock import FileLock
 
 from torchrl_sspl.baselines import tuning
-from torchrl_sspl.baselines.base import BUDGETS, SafetyMethod
+from torchrl_sspl.baselines.base import BUDGETS, EARLIER, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, record
 from torchrl_sspl.baselines.pictures import Album
 from torchrl_sspl.baselines.registry import changed, kind_of, make
@@ -271,8 +271,8 @@ def _told(path: Path, asked: dict[str, Any], options: Sequence[Sequence[str]]) -
 def run_cell(cell: Cell) -> dict[str, Any]:
     """Record, fit, score, write; or read what an earlier call has written.
 
-    Returns the row: ``cell``, ``needs``, ``minutes`` (``data``, ``fit`` of wall clock, ``fit_cpu`` of the processor, ``trials_cpu`` of all trials,
-    ``score``) and ``measurements``. Raises ConfigError for a cell that is not valid, OutputError if another row lies there or another
+    Returns the row: ``cell``, ``needs``, ``minutes`` (``data``, ``fit`` of wall clock, ``fit_cpu`` of the processor, earlier
+    processes of a training that goes on included, ``trials_cpu`` of all trials, ``score``) and ``measurements``. Raises ConfigError for a cell that is not valid, OutputError if another row lies there or another
     process is writing it. Source: none.
 
     Example:
@@ -295,7 +295,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         clock.append(time.perf_counter())
         used = time.process_time()
         _fit(method, env, cell, cell.seed)
-        used = time.process_time() - used
+        used = time.process_time() - used + method.notes.get(EARLIER, 0.0)
         clock.append(time.perf_counter())
         found = score(method, env, cell.score, kernel=_kernel(cell.env, system, cell.score.kernel_grid), album=_album(cell.env, system))
         clock.append(time.perf_counter())

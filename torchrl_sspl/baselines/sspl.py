@@ -8,14 +8,17 @@ episodes that start in S or U some leave it. The agent's policy acts by itself; 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor
 
-from torchrl_sspl.baselines.base import Budget, Guarded, Needs, Nominal, SafetyMethod
+from torchrl_sspl.baselines.base import EARLIER, Budget, Guarded, Needs, Nominal, SafetyMethod
 from torchrl_sspl.configs.reader import compose
 from torchrl_sspl.configs.schema import Config
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
@@ -23,10 +26,12 @@ from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation.controllers import AgentController, Camera
 from torchrl_sspl.experiments.run import Experiment
+from torchrl_sspl.files import write
 from torchrl_sspl.modules.agent import Agent, agent_directory, load
 from torchrl_sspl.runtime.filter import LEVEL, UNPROVED_MARGIN, Shield
 from torchrl_sspl.trainers.phases import Check
 
+CPU_FILE = "cpu.json"  # of a training: s of the processor
 # The score's pictures have no noise to be steady under, and an error of one step adds up in a memory alone.
 _PLAIN = ["augmentation.share=0.0", "synthesis.steady_steps=0", "synthesis.dynamics_steps=1500", "synthesis.unsafe_margin=0.05"]
 # One round has no second one that mends it: its checks may move the set farther in, as with few labels.
@@ -152,11 +157,23 @@ class SSPL(SafetyMethod):
         plan = ["logger=none", "trainer.progress=false", "evaluation.calibrate=true", f"seed={seed}", f"out_dir={self.directory / 'run'}"]
         plan = [*settings(self.env_name, budget), *plan]
         experiment = Experiment(compose([*plan, *self.config.overrides]))
-        agent = experiment.train().cpu()
+        with self._timed(experiment.directory / CPU_FILE):
+            agent = experiment.train().cpu()
         self.checks = experiment.work.checks
         self.notes["passed"] = float(any(check.passed for check in self.checks))
-        counted = dict(experiment.work.source.budget)
-        return agent, counted
+        experiment.work.source.count_stored()  # of a training without phases nothing is counted before
+        return agent, dict(experiment.work.source.budget)
+
+    @contextmanager
+    def _timed(self, path: Path) -> Iterator[None]:
+        """Notes the CPU time that earlier processes took of a training which goes on, and keeps that of all beside it."""
+        before = json.loads(path.read_text())["seconds"] if path.is_file() else 0.0
+        begun = time.process_time()
+        self.notes[EARLIER] = before
+        try:
+            yield
+        finally:
+            write(path, json.dumps({"seconds": before + time.process_time() - begun}) + "\n")
 
     def barrier(self, seen: Tensor) -> Tensor | None:
         """The barrier of what is seen, without a memory."""
