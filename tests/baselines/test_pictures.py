@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from torch.nn import functional as F
 
-from torchrl_sspl.baselines import make
+from torchrl_sspl.baselines import make, scoring
 from torchrl_sspl.baselines.data import pooled
 from torchrl_sspl.baselines.pictures import Album, recoloured, shifts
 from torchrl_sspl.baselines.scoring import barrier_on
 from torchrl_sspl.envs import CMUDubinsEnv, CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
+from torchrl_sspl.envs.quadruped.camera import RenderError
+from torchrl_sspl.evaluation.measurements import Evaluation
 
 
 @pytest.mark.parametrize("side", [64, 128, 256, 96, 40])
@@ -102,6 +106,28 @@ def test_other_colours_of_cmus_picture_are_those_that_it_draws_itself():
         assert (of[name](state).int() - drawn).abs().max() <= 1
         assert (env.draw(state).int() - drawn).abs().max() > 200
     assert set(of) == {"dark", "bright", "background", "object"}
+
+
+@pytest.mark.parametrize("other", [{"arena_half_size": 2.5}, {"obstacle_half_size": 0.2}, {"obstacle_centre": (0.3, 0.0)}], ids=str)
+def test_a_car_in_another_world_is_not_shown_in_the_usual_one(other):
+    assert set(shifts(DubinsEnv([1], **other))) == set(shifts(DubinsEnv([1]))) - {"renderer"} == {"dark", "bright", "background", "object"}
+
+
+def test_pictures_that_cannot_be_drawn_are_missing(monkeypatch):
+    def fails(*of):
+        raise RenderError("camera: expected the robot in the frame")
+
+    monkeypatch.setattr(scoring, "shifts", lambda env: {"renderer": fails})
+    env = PendulumEnv([1])
+    monkeypatch.setattr(scoring, "barrier_on", fails)
+    kernel = SimpleNamespace(contains=lambda state: torch.ones(len(state), dtype=torch.bool), grid=SimpleNamespace(step=[0.1, 0.1]))
+    it = scoring._Score(make("imitation"), env, kernel, scoring.ScoreConfig(episodes=2, horizon=1, shifted=2), Evaluation(), None, scoring.nominals(env))
+    scoring._shifted(it)
+    monkeypatch.setattr(scoring, "paths", fails)
+    scoring._shifted_loops(it)
+    found = it.out.to_dict().values()
+    assert len(found) == 4
+    assert all(m["value"] is None and "in the frame" in m["note"] for m in found)
 
 
 def test_of_another_system_only_the_brightness_changes():

@@ -16,6 +16,7 @@ from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
+from torchrl_sspl.envs.quadruped.camera import HALF_VIEW
 from torchrl_sspl.evaluation.measurements import Draw
 from torchrl_sspl.runtime.faults import CameraFault
 
@@ -24,6 +25,7 @@ _ROD, _OBSTACLE = (204, 77, 77), (216, 38, 38)
 #: Half a rod before white is half white: the largest difference of their colours.
 _BLEND = 178
 _NEAR = 60  # of the obstacle's colour; whatever is on the robot is farther
+_HALF_SIDE, _MIDDLE = 0.3, (0.0, 0.0)  # m, of the obstacle in PyBullet's world
 _ROWS = 500  # pictures at a time
 
 
@@ -52,7 +54,7 @@ def shifts(env: SafetyEnv) -> dict[str, Draw]:
 
     ``dark`` and ``bright``: a camera of 0.85 and 1.15 times the brightness. Of the pendulum and the Dubins cars with one obstacle also
     ``background``: cyan in place of white, and ``object``: the rod blue, the obstacle magenta; ``renderer``: gymnasium's own of the
-    pendulum, PyBullet's of the car with a square obstacle. Source: none; colours as in LatentSafe's own shifts.
+    pendulum, PyBullet's of the car with a square obstacle, where that and the view have their default sizes. Source: none; colours as in LatentSafe's own shifts.
 
     Example:
         >>> sorted(shifts(PixelPendulumEnv()))
@@ -74,7 +76,8 @@ def shifts(env: SafetyEnv) -> dict[str, Draw]:
         white, old = _grey_levels(env.background), _grey_levels(env.obstacle_colour)
         new, reach, blend = _MAGENTA, 255, 255
     elif isinstance(env, DubinsEnv) and env.obstacle_shape == "square" and env.yaw_lag is None:
-        found["renderer"] = functools.partial(_bullet, env)
+        if (env.half_view, env.obstacle_half_size, tuple(env.obstacle_centre)) == (HALF_VIEW, _HALF_SIDE, _MIDDLE):  # of the one world that there is
+            found["renderer"] = functools.partial(_bullet, env)
         old, new, reach = _OBSTACLE, _MAGENTA, _NEAR
     else:
         return found

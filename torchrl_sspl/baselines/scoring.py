@@ -16,6 +16,7 @@ from torchrl_sspl.baselines.pictures import Album, shifts
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.pendulum import PixelPendulumEnv
+from torchrl_sspl.envs.quadruped.camera import RenderError
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.evaluation.known import states_where
 from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement
@@ -385,7 +386,7 @@ def _shifted(it: _Score) -> None:
     for name in shifts(it.env):
         try:
             claimed = it.barrier(state, name)
-        except MissingDependencyError as error:
+        except (MissingDependencyError, RenderError) as error:
             it.out.missing(*(f"shifted_{name}_{n}" for n in CLAIMS), note=str(error))
             continue
         assert claimed is not None
@@ -399,7 +400,7 @@ def _shifted_loops(it: _Score) -> None:
         key = f"shifted_{name}_common_harmless_enter"
         try:
             it.out.count(key, it.episodes(start, "harmless", draw)[1], f"episodes of {it.config.horizon} steps from the common set, other pictures")
-        except MissingDependencyError as error:
+        except (MissingDependencyError, RenderError) as error:
             it.out.missing(key, note=str(error))
 
 
