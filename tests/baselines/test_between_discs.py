@@ -59,6 +59,18 @@ def test_it_counts_what_a_filter_changes(benchmark):
     assert 0.0 < found["changed"] < 1.0
 
 
+def test_the_nearest_action_on_a_grid_is_no_change(benchmark, monkeypatch):
+    env, passing = CMUTwoDiscsEnv([1], image_size=32), make("smooth_latent")
+    passing.env, passing.tried = env, torch.linspace(-2.0, 2.0, 25)
+    start = torch.tensor([[-1.2, 0.6, 0.0, 0.5], [-1.2, -0.6, 0.0, -0.5]])
+    for bad, changed in ((0, 0.0), (24, 1.0)):  # all actions are as good; one is
+        q = torch.ones(25).index_fill(0, torch.arange(bad), 0.1)
+        monkeypatch.setattr(passing, "_q", lambda seen, q=q: q.expand(len(seen), -1))
+        found = benchmark.episodes(passing, env, start, lambda x, rows: torch.full((len(x), 1), 0.07))
+        assert found["changed"] == changed
+        assert found["deviation"] > 0.0
+
+
 def test_the_command_prints_a_table_and_writes_all_of_it(benchmark, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(benchmark, "HORIZON", 4)
     monkeypatch.setattr(benchmark, "truth", lambda env: benchmark.viability_kernel(env, resolution=(21, 21, 12, 2), actions=torch.tensor([[-2.0], [2.0]])))
