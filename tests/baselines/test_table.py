@@ -210,6 +210,20 @@ def test_several_seeds_are_a_mean_and_the_worst():
     assert "60.0 % (50.0 %) | 70.0 %, 1 of 2 seeds |" in text
 
 
+def test_fewer_episodes_from_the_claimed_set_are_shown():
+    def row(common, claimed):
+        counts = {"common_harmless_enter": common, "claimed_harmless_enter": claimed, "latency_p50": 9, "latency_p99": 9}
+        return {
+            "cell": {"method": "latent_cbf"}, "minutes": {"fit_cpu": 2.0}, "needs": dict.fromkeys(["proved", "measured", "claimed"], "nothing"),
+            "measurements": {name: {"value": 0.0, "n": n} for name, n in counts.items() if n is not None},
+        }  # fmt: skip
+
+    asked = cells(["methods=latent_cbf", "env=pendulum", "seed=0,1"])
+    for counts, shown in ((((200, 200), (200, 3)), "200, 3 claimed"), (((200, 0), (200, 200)), "200"), (((200, None),) * 2, "200")):
+        text = markdown([(cell, row(*n)) for cell, n in zip(asked, counts, strict=True)])
+        assert f"| 0.0 / 0.0 ms | {shown} |" in text
+
+
 def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():
     asked = cells(["methods=sspl:agent=pendulum,sspl", "env=pendulum"])
     text = markdown([(cell, "not measured") for cell in asked])

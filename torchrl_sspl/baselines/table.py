@@ -177,8 +177,7 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
             if len(good) < len(found):
                 reason = next(str(row) for row in found if not isinstance(row, dict))
                 label = f"{label} ({len(good)} of {len(found)} seeds; {reason})"
-            episodes = str(first["measurements"].get("common_harmless_enter", {}).get("n"))
-            lines.append([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), episodes])
+            lines.append([label, budget, *(_value(good, c) for c in _MEASURED), _latency(good), _episodes(good)])
             if any(name.startswith("shifted_") for row in good for name in row["measurements"]):
                 shifted.append([label, budget, *(_on_shift(good, shift) for shift in _SHIFTS)])
             facts = ["not counted" if (n := first["needs"].get(key)) is None else str(n) for _, key in _NEEDED]
@@ -241,6 +240,14 @@ def _value(rows: list[dict[str, Any]], column: tuple[str, str, bool, Any]) -> st
     mean = show(sum(values) / len(values))
     shown = mean if len(values) == 1 else f"{mean} ({show(worst(values))})"
     return shown if len(values) == len(rows) else f"{shown}, {len(values)} of {len(rows)} seeds"
+
+
+def _episodes(rows: list[dict[str, Any]]) -> str:
+    """From how many starts episodes began, the fewest of the seeds; apart those from the claimed set where fewer were found in it."""
+    common, claimed = ([n for row in rows if (n := row["measurements"].get(f"{name}_harmless_enter", {}).get("n"))] for name in ("common", "claimed"))
+    if not common or not claimed or min(claimed) >= min(common):
+        return str(min([*common, *claimed], default="-"))
+    return f"{min(common)}, {min(claimed)} claimed"
 
 
 def _latency(rows: list[dict[str, Any]]) -> str:
