@@ -17,6 +17,8 @@ import torch
 from torch import Tensor
 
 import torchrl_sspl as sspl
+from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.evaluation.blocks import described_system
 from torchrl_sspl.evaluation.controllers import AgentController, Decision
@@ -102,7 +104,15 @@ def reachable(env: Any, state: Tensor) -> int:
     return entered
 
 
-ADVERSARIAL = {"pendulum": away_from_upright, "quadruped": towards_obstacle}
+ADVERSARIAL = ((PendulumEnv, away_from_upright), (DubinsEnv, towards_obstacle))
+
+
+def adversary_of(env: Any) -> Callable[..., Tensor]:
+    """Who wants harm of a system."""
+    for kind, wants in ADVERSARIAL:
+        if isinstance(env, kind):
+            return wants
+    raise ConfigError(f"adversarial: expected an agent of a pendulum or a Dubins car, received one of {type(env).__name__}; give --only random or --only own")
 
 
 def noisy(draw: Any, noise: float) -> Any:
@@ -165,7 +175,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     agent = sspl.load(given.agent)
     factory = described_system(agent.description)
-    assert factory is not None
+    if factory is None:
+        raise ConfigError(f"agent: expected one whose description names a system of this library, received '{given.agent}', which names none")
     env: Any = factory([1], SEED)
     env = env.known_twin() if given.physics else env
     start = starts(agent, env, given.episodes, torch.Generator().manual_seed(SEED))
@@ -173,11 +184,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.noise > 0.0 and not given.physics:
         shown = agent.barrier(encode_states(agent, env, start, draw=noisy(env.draw, given.noise)))[:, 0] <= 0.0
         print(f"Starts that this camera shows in {{B <= 0}}: {int(shown.sum()):,} of {len(start):,}\n")
-    if given.agent == "quadruped" and given.only in (None, "adversarial"):
+    worst = adversary_of(env) if given.only in (None, "adversarial") else None
+    if worst is towards_obstacle:
         print(f"Starts from which one of {len(PLANS):,} plans enters U before the car leaves: {reachable(env, start):,} of {len(start):,}\n")
     print("| Actions | filter | episodes that enter U | hit | fallen | steps with an intervention | mean deviation [half ranges] |")
     print("|---|---|---|---|---|---|---|")
-    policies = {"random": random_actions, "adversarial": ADVERSARIAL[given.agent], "own": None}
+    policies = {"random": random_actions, "adversarial": worst, "own": None}
     for label, wants in policies.items():
         for level in (None, *(given.levels or (0.0, LEVEL))) if given.only in (None, label) else ():
             options = None if level is None else {"level": level, "margin": margin}

@@ -155,6 +155,23 @@ def test_a_training_needs_a_directory(systems):
         make("sspl").fit(None, systems["pendulum"][0], BUDGETS["tiny"], 0)
 
 
+@pytest.mark.parametrize("name", ["latent_cbf", "latent_safe", "smooth_latent"])
+def test_methods_of_one_action_refuse_systems_of_several(name, monkeypatch):
+    env = PendulumEnv([1])
+    monkeypatch.setattr(env, "action_dim", 2)
+    with pytest.raises(ConfigError, match=f"{name}: expected a system of one action.* received PixelPendulumEnv with 2"):
+        make(name).fit(None, env, BUDGETS["tiny"], 0)
+
+
+def test_a_system_without_a_time_step_is_refused_and_so_is_a_level_above_zero():
+    env = PendulumEnv([1])
+    del env.dt
+    with pytest.raises(ConfigError, match=r"latent_cbf: expected .* attribute dt is the time step .* and dt=None; set dt"):
+        make("latent_cbf").fit(None, env, BUDGETS["tiny"], 0)
+    with pytest.raises(ConfigError, match=r"sspl: expected level <= 0, of the filter, received 0\.1"):
+        Cell.of("sspl", ["filter=true", "level=0.1"])
+
+
 def test_larger_pictures_are_taken_as_they_are_or_refused():
     env, budget = CMUTwoDiscsEnv([16]), Budget("try", 60, 8, 8)
     data = record(env, budget, 0, size=64)

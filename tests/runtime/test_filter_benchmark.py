@@ -6,8 +6,13 @@ import importlib
 from pathlib import Path
 
 import pytest
+import torch
 
+import torchrl_sspl as sspl
+from torchrl_sspl.envs import CMUTwoDiscsEnv
+from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.evaluation import simulation
+from torchrl_sspl.evaluation.simulation import Episodes
 
 
 @pytest.fixture
@@ -36,3 +41,25 @@ def test_actions_that_somebody_else_draws_are_counted_over_all_episodes(benchmar
     rows = [line.split(" | ") for line in capsys.readouterr().out.splitlines() if line.startswith("| random")]
     assert rows[0][-2:] == ["-", "- |"]
     assert float(rows[1][-2].strip("% ")) > 50.0
+
+
+@pytest.mark.parametrize(("agent", "name"), [("pendulum", "away_from_upright"), ("quadruped", "towards_obstacle")])
+def test_the_adversary_of_a_saved_agent_is_that_of_its_system(benchmark, monkeypatch, tmp_path, agent, name):
+    sspl.load(agent).save(tmp_path / "own")
+    asked: list[str] = []
+    nothing = Episodes(torch.zeros(0, 0, 1), torch.zeros(1, 0, dtype=torch.long), torch.zeros(1, 0, dtype=torch.bool))
+    monkeypatch.setattr(benchmark, "reachable", lambda env, start: 0)
+    monkeypatch.setattr(benchmark, "starts", lambda agent, env, *of: torch.zeros(0, env.state_dim))
+    monkeypatch.setattr(benchmark, "on_known_dynamics", lambda *of: (asked.append(of[4].__name__), (nothing, "- | -"))[1])
+    benchmark.main([str(tmp_path / "own"), "1", "--only", "adversarial"])
+    assert set(asked) == {name}
+
+
+def test_a_system_without_an_adversary_is_named(benchmark, monkeypatch):
+    monkeypatch.setattr(benchmark, "described_system", lambda description: lambda size, seed: CMUTwoDiscsEnv(size, seed=seed))
+    monkeypatch.setattr(benchmark, "starts", lambda agent, env, *of: torch.zeros(0, env.state_dim))
+    with pytest.raises(ConfigError, match="expected an agent of a pendulum or a Dubins car, received one of CMUTwoDiscsEnv; give --only random"):
+        benchmark.main(["pendulum", "1"])
+    monkeypatch.setattr(benchmark, "described_system", lambda description: None)
+    with pytest.raises(ConfigError, match="expected one whose description names a system of this library, received 'pendulum'"):
+        benchmark.main(["pendulum", "1"])

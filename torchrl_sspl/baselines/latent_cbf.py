@@ -108,6 +108,11 @@ class LatentCBF(OneStepFilter):
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Autoencoder, dynamics, barrier, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
+        if env.action_dim != 1 or getattr(env, "dt", None) is None:
+            raise ConfigError(
+                f"{self.name}: expected a system of one action, whose attribute dt is the time step [s], received {type(env).__name__} with "
+                f"{env.action_dim} actions and dt={getattr(env, 'dt', None)}; set dt, or take a method of another kind for more actions"
+            )
         if data.frames.shape[-1] != POOL:
             raise ConfigError(f"{self.name}: expected pictures of {POOL} x {POOL}, received {data.frames.shape[-1]} x {data.frames.shape[-1]}")
         self.env, self.alpha, self.offset = env, c.alpha, c.offset

@@ -65,6 +65,8 @@ class LatentSafe(SafetyMethod):
         c = self.config
         if not 0.0 <= c.discount < 1.0:
             raise ConfigError(f"{self.name}: expected discount in [0, 1), received {c.discount}")
+        if env.action_dim != 1:
+            raise ConfigError(f"{self.name}: expected a system of one action, received {type(env).__name__} with {env.action_dim}; take a method of another kind")
         self.env = env
         failed = data.region == UNSAFE
         region = torch.where(failed, UNSAFE, SAFE)

@@ -128,6 +128,11 @@ class SSPL(SafetyMethod):
 
     checks: Sequence[Check] = ()  # of its training, by round
 
+    def __init__(self, config: Any = None) -> None:
+        super().__init__(config)
+        if not self.config.level <= 0.0:
+            raise ConfigError(f"{self.name}: expected level <= 0, of the filter, received {self.config.level}; such as level={LEVEL}")
+
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Load the agent, or train one with the budget; see :meth:`SafetyMethod.fit`."""
         self.env = env
