@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from analytic import line_agent
 
 import torchrl_sspl
 from torchrl_sspl import cli
@@ -322,6 +323,30 @@ def test_calibrate_writes_limits_that_the_monitor_reads(tmp_path, capsys):
     assert "innovation" in shown
     assert "100 % expected" in shown  # of four episodes
     assert torchrl_sspl.Monitor.load(tmp_path / "run").calibration.episodes == 4
+
+
+def test_a_system_of_ones_own_is_calibrated_where_it_is_trusted(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my_line.py").write_text("from analytic import Line, Reader\n\n\nclass Road(Line):\n    pass\n\n\nclass Eye(Reader):\n    pass\n")
+    agent = line_agent(config={"env": {"_target_": "my_line:Road"}})
+    agent.save("run")
+    words = ["calibrate", "run", *QUICK, "--noise", "0"]
+    assert cli.main(words) == 2
+    assert "--trust" in capsys.readouterr().err
+    assert "my_line" not in sys.modules
+    assert cli.main([*words, "--trust"]) == 0
+    assert torchrl_sspl.Monitor.load("run").calibration.episodes == 4
+    agent.description["networks"]["encoder"]["class"] = "my_line:Eye"
+    agent.save("run")
+    sys.modules.pop("my_line")
+    assert cli.main(words) == 2
+    assert "received 'my_line:Eye', whose import runs code" in capsys.readouterr().err
+    assert "my_line" not in sys.modules
+    assert cli.main([*words, "--trust"]) == 0
+    sys.modules.pop("my_line")
+    line_agent(config={"env": {"made by": "my.make 123"}}).save("code")
+    assert cli.main(["calibrate", "code", "--trust"]) == 2
+    assert "given in code, call sspl.calibrate(agent, env) there" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -302,6 +302,7 @@ def _calibrate(words: list[str]) -> int:
     parser.add_argument("--steps", type=int, default=3000, help="steps of the model's fit (default: 3000)")
     parser.add_argument("--noise", type=float, default=1.0, help="noise of the camera, grey levels (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="random seed")
+    parser.add_argument("--trust", action="store_true", help="run code of its own that the agent names: networks, a system")
     given = parser.parse_args(words)
     from torchrl_sspl.evaluation.blocks import described_system
     from torchrl_sspl.modules.agent import Agent, agent_directory
@@ -315,13 +316,16 @@ def _calibrate(words: list[str]) -> int:
     directory = agent_directory(given.agent)
     if given.out is None and directory.resolve().is_relative_to(Path(__file__).resolve().parent):
         raise ConfigError(f"expected --out DIRECTORY with a shipped agent, received none; '{given.agent}' has its own calibration")
-    agent = Agent.load(directory)
-    factory = described_system(agent.description)
-    env = None if factory is None else factory(batch_size=[1], seed=given.seed)
-    if not hasattr(env, "previous_state"):
-        raise ConfigError("expected an agent whose system's states are known, received another one; call calibrate(agent, env) on yours")
+    agent = Agent.load(directory, trust=given.trust)
+    factory = described_system(agent.description, trust=given.trust)
+    if factory is None:
+        more = "run in the folder that holds its module" if given.trust else "one of your own (env._target_=module:Env) needs --trust, which runs its code"
+        raise ConfigError(
+            f"expected an agent that names a system that can be built here, received another one; {more}; if it was given in code, call "
+            "sspl.calibrate(agent, env) there"
+        )
     found = calibrate(
-        agent, env, episodes=given.episodes, horizon=given.horizon, pictures=given.pictures, steps=given.steps, noise=given.noise,
+        agent, factory(batch_size=[1], seed=given.seed), episodes=given.episodes, horizon=given.horizon, pictures=given.pictures, steps=given.steps, noise=given.noise,
         seed=given.seed, progress=sys.stderr.isatty(),
     )  # fmt: skip
     for name, (low, high) in found.limits.items():

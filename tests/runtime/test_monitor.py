@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import shutil
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
+import gymnasium
 import pytest
 import torch
 from torch import Tensor
 
-from torchrl_sspl.envs import PendulumEnv
+from torchrl_sspl.envs import GymnasiumPixels, PendulumEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError, ShapeError
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.evaluation.controllers import as_controller
@@ -272,6 +274,15 @@ def test_a_calibration_calls_its_own_episodes_clean_and_a_fault_strange():
         alarms[strength] = watching.alarms().any(0).float().mean()
     assert float(alarms[1.0]) < 0.5
     assert float(alarms[0.0]) == 1.0
+
+
+def test_a_system_whose_states_are_unknown_is_not_calibrated():
+    env = GymnasiumPixels(
+        partial(gymnasium.make, "CartPole-v1", render_mode="rgb_array"), safe=lambda s, _: abs(s[2]) < 0.05, unsafe=lambda s, _: abs(s[2]) > 0.1,
+        image_size=64, seed=0,
+    )  # fmt: skip
+    with closing(env), pytest.raises(ConfigError, match=r"expected a SafetyEnv.*received GymnasiumPixels.*agent\.controller"):
+        calibrate(load("pendulum"), env, episodes=2, horizon=2, pictures=10, steps=1)
 
 
 def test_every_fault_changes_what_is_shown_at_every_strength():

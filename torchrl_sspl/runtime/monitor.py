@@ -20,6 +20,7 @@ from tqdm import tqdm
 
 from torchrl_sspl.certification.certificate import weights_digest
 from torchrl_sspl.devices import compiled
+from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
 from torchrl_sspl.evaluation.controllers import Decision
 from torchrl_sspl.evaluation.simulation import simulate
@@ -436,7 +437,7 @@ def calibrate(
 
     Args:
         agent: frozen agent.
-        env: a system of this library, whose states are known; it is only asked for pictures and starts.
+        env: a ``SafetyEnv``, whose states are known; it is asked for pictures and starts, and the agent acts in it.
         episodes: for the limits; the false alarms are as rare as there are many.
         horizon: steps of each.
         noise: standard deviation of the camera's noise, grey levels, added to every frame.
@@ -445,9 +446,16 @@ def calibrate(
         seed: root of everything drawn.
         progress: show progress bars.
 
-    Raises ConfigError for a noise that is negative or not finite, or if no start lies in the set. Source: none.
+    Raises ConfigError for a noise that is negative or not finite, a system that is no ``SafetyEnv``, or if no start lies in the set.
+    Source: none.
     """
     camera = CameraFault("dark", 1.0, noise=noise, seed=spawn(seed, "monitor", 3))
+    if not isinstance(env, SafetyEnv):
+        raise ConfigError(
+            f"expected a SafetyEnv, which draws its pictures from states, received {type(env).__name__}; write your system as one "
+            "(docs/extend.md, Your own system with known dynamics), or run the agent without alarms: agent.controller() says at every step whether it is in the set "
+            "and whether the proof applies"
+        )
     agent = copy.deepcopy(agent).cpu()  # where the system is
     g = torch.Generator().manual_seed(spawn(seed, "monitor", 0))
     with torch.random.fork_rng():
