@@ -25,6 +25,7 @@ from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.experiments.description import describe, differences
 from torchrl_sspl.experiments.own_systems import advice
 from torchrl_sspl.experiments.run import Experiment, run_experiment
+from torchrl_sspl.modules import FrameEncoder
 from torchrl_sspl.sets import UNLABELLED
 from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.stepper import SSPLStepper
@@ -296,6 +297,25 @@ def test_an_agent_of_a_system_in_code_is_not_measured_on_another(tmp_path):
     build(tmp_path, "trainer.total_frames=128").train()
     with pytest.raises(CheckpointError, match="it was given in code; call evaluate_episodes"):
         evaluate_agent(str(tmp_path))
+
+
+class Eye(FrameEncoder):
+    def __init__(self, latent_dim, image_size=64):
+        super().__init__(latent_dim, pool_to=8)
+        self.told = image_size
+
+
+@pytest.mark.parametrize(("wide", "told"), [(16, 16), (8, [16, 8])])
+def test_encoders_are_told_the_size_of_the_pictures_of_any_system(wide, told, tmp_path, monkeypatch):
+    probe = Experiment._probe
+
+    def narrow(experiment):
+        env, pixels = probe(experiment)
+        return env, pixels[..., :wide]
+
+    monkeypatch.setattr(Experiment, "_probe", narrow)
+    made = Experiment(compose([*SMALL, UNSAVED, f"out_dir={tmp_path}"]), everywhere, encoder=Eye)
+    assert made.encoder.told == told
 
 
 class ManyActions(Lane):

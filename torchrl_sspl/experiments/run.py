@@ -124,6 +124,8 @@ class Experiment:
         self.known = isinstance(self.env, SafetyEnv)
         self.title = title or (self.env.system.title if self.known else "Safe policy from pixels")  # type: ignore[union-attr]
         self._given_encoder = encoder
+        height, width = pixels.shape[-2:]
+        self._image_size = height if height == width else [height, width]
         torch.manual_seed(config.seed)
         self.encoder, self.dynamics, self.barrier, self.policy = self._networks()
         check_encoder(self.encoder, pixels.to(self.device), config.network.latent_dim)
@@ -181,9 +183,8 @@ class Experiment:
     def _networks(self) -> tuple[nn.Module, nn.Module, nn.Module, nn.Module]:
         net = self.config.network
         scale = self._high.tolist()
-        options = {"latent_dim": net.latent_dim, "pool_to": net.pool_to, "velocity_gain": net.velocity_gain}
-        if self.known:
-            options["image_size"] = self.env.image_size  # type: ignore[assignment]
+        options: dict[str, Any] = {"latent_dim": net.latent_dim, "pool_to": net.pool_to, "velocity_gain": net.velocity_gain}
+        options["image_size"] = self._image_size
         given = self._given_encoder
         encoder = build_encoder(net.encoder, **options) if given is None else call_with(given, options)
         turns = getattr(encoder, "turn_radius", 0.0)
