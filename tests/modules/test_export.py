@@ -12,7 +12,7 @@ import torch
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CertificationError, ConfigError
 from torchrl_sspl.modules.agent import load
-from torchrl_sspl.modules.export import INPUTS, OUTPUTS, DeployedStep, _compare, _steps
+from torchrl_sspl.modules.export import INPUTS, OUTPUTS, DeployedStep, _about, _compare, _steps
 from torchrl_sspl.modules.observer import corrected
 
 
@@ -75,6 +75,29 @@ def test_the_file_says_what_it_is(onnx_file):
     assert about["pixels"] == [6, 64, 64]
     assert about["action_scale"] == [10.0]
     assert about["tolerated_error"] == load("pendulum").tolerated_error
+    assert about["dt"] == PendulumEnv().dt
+
+
+@pytest.mark.parametrize(
+    ("description", "period"),
+    [
+        ({"environment": "PendulumEnv"}, 0.05),
+        ({"config": {"env": {"_target_": "torchrl_sspl.envs.PendulumEnv", "dt": 0.02}}}, 0.02),
+        ({"config": {"env": {"_target_": "my_system:Cart", "dt": 1}}}, 1.0),  # its code is not run
+        ({"config": {"env": {"_target_": "my_system:Cart"}}}, None),
+        ({"config": {"env": {"made by": "my.make", "dt": "half"}}}, None),
+        ({"config": 3}, None),
+        ({}, None),
+    ],
+)
+def test_the_period_is_told_where_the_description_says_it(description, period):
+    agent = load("pendulum")
+    agent.description = description
+    assert _about(agent).get("dt") == period
+
+
+def test_the_shipped_agents_say_their_periods():
+    assert [_about(load(name))["dt"] for name in ("pendulum", "quadruped")] == [0.05, 0.1]
 
 
 def test_programmes_of_torch_are_checked_too(tmp_path):

@@ -6,6 +6,7 @@ import copy
 import io
 import json
 import warnings
+from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -67,7 +68,8 @@ def export(agent: Any, path: str | Path, *, check: int = 256) -> Path:
     """Writes one step of an agent, :class:`DeployedStep`, for a machine without this library.
 
     The suffix says what: ``.onnx`` for onnxruntime and the like, ``.pt2`` for ``torch.export.load``. The batch is dynamic. An ONNX
-    file carries the agent's sizes, its digest and its tolerated error as metadata.
+    file carries the agent's sizes, its digest, its tolerated error and, where its description names a system of this library or says it,
+    the time ``dt`` between two steps in s as metadata.
 
     Args:
         agent: frozen agent.
@@ -118,10 +120,25 @@ def _required(package: str) -> Any:
 
 def _about(agent: Any) -> dict[str, Any]:
     """What a machine that runs the file has to know."""
-    return {
+    about = {
         "pixels": list(_picture(agent)), "latent_dim": agent.latent_dim, "tolerated_error": agent.tolerated_error,
         "action_scale": agent.policy.action_scale.flatten().tolist(), "weights": weights_digest(agent.state_dict()),  # type: ignore[operator, union-attr]
     }  # fmt: skip
+    period = _period(agent)
+    return about if period is None else about | {"dt": period}
+
+
+def _period(agent: Any) -> float | None:
+    """Time between two steps in s; None where the agent's description does not say it."""
+    from torchrl_sspl.evaluation.blocks import described_system  # which imports agents
+
+    config = agent.description.get("config")
+    named = config.get("env") if isinstance(config, Mapping) else None
+    period = named.get("dt") if isinstance(named, Mapping) else None
+    if period is None:
+        factory = described_system(agent.description)  # of this library: no code of others is run
+        period = None if factory is None else getattr(factory(batch_size=[1], seed=0), "dt", None)
+    return float(period) if isinstance(period, (int, float)) else None
 
 
 def _picture(agent: Any) -> tuple[int, int, int]:
