@@ -15,15 +15,12 @@ import pytest
 import torch
 
 from torchrl_sspl.certification import Budget
-from torchrl_sspl.modules import agent
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 if not (ROOT / "torchrl_sspl").is_dir():
     pytest.skip("needs a checkout", allow_module_level=True)
 PAGES = sorted(path for path in DOCS.rglob("*.md"))
-# What a page leaves to its reader.
-GIVEN = {"bring_your_own.md": {"MyEncoder": torch.nn.Identity}}
 
 
 def load(name: str) -> ModuleType:
@@ -55,12 +52,11 @@ CODE = [pytest.param(path, id=str(path.relative_to(DOCS))) for path in PAGES if 
 @pytest.mark.parametrize("path", CODE)
 def test_code_of_the_page_runs(path, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("torchrl_sspl.modules.agent.ENCODERS", dict(agent.ENCODERS))
     # Proofs of shipped agents have tests of their own, and pages only print what comes out.
     monkeypatch.setattr("torchrl_sspl.evaluation.certify.Budget", lambda **_: Budget(boxes=200))
     state = torch.get_rng_state()
     try:
-        exec(compile(code(path), str(path), "exec"), {"__name__": "page", **GIVEN.get(path.name, {})})
+        exec(compile(code(path), str(path), "exec"), {"__name__": "page"})
     finally:
         torch.set_rng_state(state)
 
