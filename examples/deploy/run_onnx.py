@@ -3,6 +3,11 @@
     python -c "import torchrl_sspl as sspl; sspl.load('pendulum').export('pendulum.onnx')"
     python examples/deploy/run_onnx.py pendulum.onnx run.mp4
 
+An .mp4 needs `imageio[ffmpeg]`. With this library two lines write one that fits, of a pendulum under random actions:
+
+    env = sspl.envs.PendulumEnv(seed=0)
+    iio.imwrite("run.mp4", env.rollout(40)["pixels"][0, :, 3:].permute(0, 2, 3, 1).numpy(), fps=1 / env.dt, quality=10)
+
 Every frame of the file is one step of the system. The action that is printed is the one the agent would take; what was really
 taken is not in a film, so the memory assumes that it was taken (give `taken=` to `OnnxAgent.step` on a robot).
 """

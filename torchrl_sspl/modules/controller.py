@@ -148,7 +148,7 @@ class Controller:
     Args:
         agent: frozen agent; ``agent.tolerated_error`` is :math:`\delta`, zero where nothing is proved.
         batch_size: n.
-        compile: compute a step as one graph (``torch.compile``): two to three times as fast, once the first one has taken its half
+        compile: compute a step as one graph (``torch.compile``): 1.4 to 2 times as fast, once the first one has taken its half
             minute. Needs a C++ compiler. Numbers are rounded in another order.
 
     Raises:
