@@ -14,6 +14,7 @@ from types import ModuleType
 import pytest
 import torch
 
+from torchrl_sspl import cli
 from torchrl_sspl.certification import Budget
 
 ROOT = Path(__file__).parents[1]
@@ -59,6 +60,18 @@ def test_code_of_the_page_runs(path, tmp_path, monkeypatch):
         exec(compile(code(path), str(path), "exec"), {"__name__": "page"})
     finally:
         torch.set_rng_state(state)
+
+
+TRAIN = [
+    pytest.param(line.split("#")[0].split()[2:], id=f"{path.stem}:{number}")
+    for path in PAGES for number, line in enumerate(path.read_text().splitlines(), 1)
+    if line.startswith("sspl train ") and "my_system" not in line and "--help" not in line  # of the reader's own
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("words", TRAIN)
+def test_lines_that_train_are_accepted(words, capsys):
+    assert cli.main(["train", *words, *(() if "--cfg" in words else ("--cfg", "job"))]) == 0, capsys.readouterr().err
 
 
 def test_code_of_a_page_keeps_its_lines(tmp_path):
