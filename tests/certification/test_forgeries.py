@@ -61,7 +61,7 @@ def regenerated(change: Callable[[Body], None]) -> Callable[[Body], None]:
     def forge(body: Body) -> None:
         change(body["record"])
         record = Record.from_dict(body["record"])
-        found = (s["value"] for s in body["layers"]["deterministic"]["statements"] if s["name"] == "tolerated error")
+        found = (s["value"] for s in body["layers"]["deterministic"]["statements"] if s["name"] == "float32")
         tolerated = next(found, None)
         for layer in (statistical_layer(record), run_time_layer(record, tolerated), paper_layer(record, 1.5)):
             body["layers"][layer.name] = json.loads(json.dumps({"name": layer.name, "statements": [vars(s) for s in layer.statements], "verdict": layer.verdict}))
@@ -141,7 +141,8 @@ FORGED: dict[str, tuple[Callable[[Body], Any], Reason]] = {
     "delta* zero and holds, which is weaker than the truth and no claim": (
         lambda b: (to("tolerated error", value=0.0)(b), regenerated(lambda r: None)(b)), NUMBERS),
     "delta* missing and holds": (to("tolerated error", value=None), NUMBERS),
-    "float32 error above the truth": (to("float32", value=0.1336), NUMBERS),
+    "float32 error above the truth": (
+        lambda b: (to("float32", value=0.1336)(b), regenerated(lambda r: None)(b)), NUMBERS),
     "float32 roundings made small": (to("float32", detail="rounding of B at most 1e-12, of d(z, pi(z)) at most 1e-12"), TEXT),
     "Lipschitz constant lowered": (to("Lipschitz constant", value=1.0), NUMBERS),
     "Lipschitz constant lowered in the text": (to("Lipschitz constant", text="B is 1-Lipschitz (exact arithmetic on the deployed weights)"), TEXT),
@@ -213,6 +214,49 @@ def test_a_forgery_with_a_fitting_digest_is_refused(name, issued, tmp_path):
     assert code == Exit.REFUSED, text
     assert f"FAILED {reason.name}" in text, text
     assert "OK" not in text
+
+
+#: Errors that an agent tolerates and that are not proved: in real numbers, in those that are computed.
+TOO_LARGE = {"tolerated error": 0.2, "float32": 0.1}
+
+
+def cancelling(**description: Any) -> Agent:
+    """The same loop with two large terms that cancel: of the error that real numbers tolerate, float32 leaves half."""
+    agent, large = line_agent(**description), 1e5
+    net = agent.dynamics.net
+    net[0].bias.data[0] = large
+    net[2].weight.data[0] = torch.tensor([0.8, 0.0, 0.0, 0.0])
+    net[2].bias.data[0] = -float(net[2].weight[0, 0]) * large
+    return agent
+
+
+def _is_said_to_hold(body: Body, name: str) -> None:
+    to(name, holds=True, reason="", misses_by=None)(body)
+
+
+def _is_left_out(body: Body, name: str) -> None:
+    layer = body["layers"]["deterministic"]
+    layer["statements"] = [s for s in layer["statements"] if s["name"] != name]
+
+
+@pytest.mark.parametrize("forge", [None, _is_said_to_hold, _is_left_out])
+@pytest.mark.parametrize("name", TOO_LARGE)
+def test_an_agent_that_tolerates_more_than_is_proved_says_so_or_is_refused(name, forge, tmp_path):
+    agent = cancelling(tolerated_error=0.1) if name == "float32" else line_agent(tolerated_error=TOO_LARGE[name])
+    agent.save(tmp_path)
+    certify(agent, None, name="line").save(tmp_path / "certificate.json")
+    body = read(tmp_path)
+    assert statement(body, name)["holds"] is False
+    if forge is None:
+        code, text = verify(tmp_path, env=None)
+        assert code == Exit.HOLDS, text
+        assert "these layers are not certified: deterministic" in text
+        return
+    forge(body, name)
+    verdicts(body)
+    write(tmp_path, body)
+    code, text = verify(tmp_path, env=None)
+    assert code == Exit.REFUSED, text
 
 
 @pytest.mark.parametrize("name", list(FORGED)[::7])

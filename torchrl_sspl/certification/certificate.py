@@ -348,6 +348,7 @@ def differences(
     *,
     confirm: Callable[[str, float], bool | None] | None = None,
     repeat: Callable[[int], Layer] | None = None,
+    required: float = 0.0,
 ) -> dict[Reason, str]:
     """What a certificate claims about its weights that a recomputation does not give, by reason; empty if all agrees.
 
@@ -362,6 +363,7 @@ def differences(
             smaller; None: not in time.
         repeat: the deterministic layer, computed with at most a number of boxes: whoever claims to have given up after
             so many has to have.
+        required: error that the agent's monitor tolerates, latent units: no smaller one is a tolerated error that holds.
 
     Example:
         >>> one = Certificate("a", "0", "0", 0.0, {})
@@ -385,7 +387,7 @@ def differences(
     for name, layer in claimed.layers.items():
         other = recomputed.layers[name]
         if name == "deterministic":
-            changes = _proof_changes(layer, other, confirm, repeat)
+            changes = _proof_changes(layer, other, required, confirm, repeat)
         else:
             changes = _measured_changes(layer, other)
         for reason, detail in changes:
@@ -408,7 +410,7 @@ def _measured_changes(mine: Layer, other: Layer) -> list[tuple[Reason, str]]:
 
 
 def _proof_changes(
-    mine: Layer, other: Layer, confirm: Callable[[str, float], bool | None] | None, repeat: Callable[[int], Layer] | None
+    mine: Layer, other: Layer, required: float, confirm: Callable[[str, float], bool | None] | None, repeat: Callable[[int], Layer] | None
 ) -> list[tuple[Reason, str]]:
     """What the deterministic layer claims beyond what was proved again."""
     early, late = (any(_gave_up(s) or _falls_short(s) for s in layer.statements) for layer in (mine, other))
@@ -423,7 +425,7 @@ def _proof_changes(
         other = with_so_little_effort() or other
     there, changes = {s.name: s for s in other.statements}, []
     named = _same_names(mine, other, early or late)
-    if not named:
+    if not named or not _bounds_are_all_there(mine):
         changes.append((Reason.TEXT_CHANGED, "other statements than the weights give"))
     for a in (s for s in mine.statements if named or s.name in there):
         b = there.get(a.name)
@@ -433,7 +435,7 @@ def _proof_changes(
         elif b is None or (_gave_up(b) and not _gave_up(a)):
             changes.append((Reason.UNDECIDED, f"{a.name}: not decided again in the time"))
         elif not _gave_up(a):
-            changes += _decided_changes(a, b, confirm)
+            changes += _decided_changes(a, b, required, confirm)
         elif not _EFFORT.fullmatch(a.detail) or a.value is not None or a.misses_by is not None:
             changes.append((Reason.TEXT_CHANGED, f"{a.name}: detail or number not as computed"))
         elif b.holds is False and not _gave_up(b):
@@ -450,13 +452,21 @@ def _same_names(mine: Layer, other: Layer, partly: bool) -> bool:
     return first == second
 
 
+def _bounds_are_all_there(layer: Layer) -> bool:
+    """Whether the bounds on errors are those that a layer has: of an invariant set one, which, if it holds, is followed by that of the computed numbers."""
+    held = {s.name: s.holds for s in layer.statements}
+    found = [s.name for s in layer.statements if s.name in LOWER_BOUNDS]
+    expected = 0 if not held.get("invariance") else 2 if held.get(TOLERATED) else 1
+    return len(found) == expected and found[:1] == [TOLERATED][:expected]
+
+
 def _decided_changes(
-    a: Statement, b: Statement, confirm: Callable[[str, float], bool | None] | None
+    a: Statement, b: Statement, required: float, confirm: Callable[[str, float], bool | None] | None
 ) -> list[tuple[Reason, str]]:
     """Both decided: the verdict is the same, and no number is better."""
     numbers = f"claimed {a.holds} {_number(a.value)}, recomputed {b.holds} {_number(b.value)}"
     if a.name in LOWER_BOUNDS:
-        return _tolerated_changes(a, b, confirm)
+        return _tolerated_changes(a, b, required, confirm)
     if a.holds != b.holds or a.reason != b.reason or not _not_better(a, b):
         return [(Reason.NUMBERS_CHANGED, f"{a.name}: {numbers}")]
     if a.holds is False:
@@ -479,19 +489,19 @@ _UPPER = ("rounding",)
 
 
 def _tolerated_changes(
-    a: Statement, b: Statement, confirm: Callable[[str, float], bool | None] | None
+    a: Statement, b: Statement, required: float, confirm: Callable[[str, float], bool | None] | None
 ) -> list[tuple[Reason, str]]:
     """Lower bounds, from searches that end within a tolerance: less is weaker, more has to be proved itself."""
     numbers = f"{a.name}: claimed {a.holds} {_number(a.value)}, recomputed {b.holds} {_number(b.value)}"
     if _words(a.detail) != _words(b.detail):
         return [(Reason.TEXT_CHANGED, f"{a.name}: detail not as computed")]
-    if a.value is None or not a.holds:
+    if a.value is None or not (a.value >= required and a.value > 0.0):
         less = a.value is None or (b.value is not None and a.value <= b.value + 1e-9 * abs(b.value))
-        missed = _close(a.misses_by, None if a.value is None else max(-a.value, 0.0))
+        missed = _close(a.misses_by, None if a.value is None else max(required - a.value, 0.0))
         short = Reason.MARGIN_TOO_SMALL if a.name == TOLERATED else Reason.ROUNDING
         weaker = less and missed and not a.holds and a.reason == short.name
         return [] if weaker else [(Reason.NUMBERS_CHANGED, numbers)]
-    if a.value <= 0.0 or a.misses_by is not None:
+    if not a.holds or a.misses_by is not None:
         return [(Reason.NUMBERS_CHANGED, numbers)]
     said, found = ([float(m.group()) for m in _NUMBER.finditer(s.detail)] for s in (a, b))
     if a.name == TOLERATED and any(limit < a.value for limit in said):

@@ -35,7 +35,7 @@ from torchrl_sspl.certification.floating import UNITS
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
 from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.certification.record import Counts, Record
-from torchrl_sspl.certification.rounding import missed, shown
+from torchrl_sspl.certification.rounding import LOWER_BOUNDS, missed, shown
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CertificationError, CheckpointError, ConfigError, SSPLError
@@ -347,11 +347,11 @@ def _kept_block(source: Any, index: int, about: Any) -> Block:
 
 
 def _tolerated(certificate: Certificate, agent: Agent) -> float | None:
-    """Error above which the proof does not apply: that of the agent's monitor, or what is proved where it has none."""
+    """Error above which the proof does not apply: that of the agent's monitor, or what is proved of the computed numbers where it has none."""
     proof = certificate.layers["deterministic"]
     if not proof.holds:
         return None
-    return agent.tolerated_error or next((s.value for s in proof.statements if s.name == TOLERATED), None)
+    return agent.tolerated_error or next((s.value for s in proof.statements if s.name in LOWER_BOUNDS and s.name != TOLERATED), None)
 
 
 def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> dict[str, Layer]:
@@ -449,7 +449,7 @@ def _verify(
     again.layers["deterministic"] = claimed.layers["deterministic"]  # first what takes no time
     if claimed.record is not None:
         again.layers |= _measured_layers(claimed.record, claimed, agent)
-    found = differences(claimed, again) | _history(claimed, agent)
+    found = differences(claimed, again, required=agent.tolerated_error) | _history(claimed, agent)
     _refuse(found)
     budget = Budget(seconds=seconds / 3)
 
@@ -459,7 +459,7 @@ def _verify(
     def compared(layer: Layer) -> dict[Reason, str]:
         again.layers["deterministic"] = layer
         return differences(
-            claimed, again, confirm=lambda name, delta: _is_proved(agent, claimed.level, name, delta, budget), repeat=proved
+            claimed, again, confirm=lambda name, delta: _is_proved(agent, claimed.level, name, delta, budget), repeat=proved, required=agent.tolerated_error,
         )
 
     # Where a search is said to have given up, as much effort is enough to see that nothing more is claimed.
