@@ -12,8 +12,9 @@ from torchrl_sspl.certification.branch_and_bound import Budget, Problem, maximis
 from torchrl_sspl.certification.floating import rounding_bound
 from torchrl_sspl.certification.graph import Graph
 from torchrl_sspl.certification.half_spaces import clip, programme
+from torchrl_sspl.certification.loop import closed_loop, evaluation_rounding
 from torchrl_sspl.certification.propagation import Enclosure, LinearBound, interval_bounds
-from torchrl_sspl.errors import ConfigError, ShapeError
+from torchrl_sspl.errors import ConfigError, ShapeError, StructureError
 from torchrl_sspl.lipschitz import layers as activations
 from torchrl_sspl.lipschitz.layers import Abs, Relaxation, activation_of, clamp
 
@@ -254,3 +255,18 @@ def test_wrong_shapes_and_unknown_layers_are_refused():
         graph.network(0, nn.Sequential(layer))
     with pytest.raises(ConfigError, match="boxes"):
         Budget(boxes=-1)
+
+
+def test_a_barrier_that_begins_with_an_activation_is_refused():
+    # |z| - 0.3 after z+ = 0: an error of 0.9 leaves the set, whatever its activation is bounded by without the error.
+    barrier, plant = nn.Sequential(Abs(), nn.Linear(1, 1)), nn.Sequential(nn.Linear(2, 1))
+    with pytest.raises(StructureError, match=r"put an nn\.Linear before it"):
+        closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+
+
+def test_rounding_of_many_latents_is_bounded_in_fewer_pieces():
+    p = 12
+    plant = nn.Sequential(nn.Linear(p + 1, p))
+    of = {"latent_dim": p, "lipschitz_bound": 9.0}
+    system = closed_loop(nn.Sequential(nn.Linear(p, 1)), plant, nn.Sequential(nn.Linear(p, 1)), **of)
+    assert 0.0 < evaluation_rounding(system) < 1e-12

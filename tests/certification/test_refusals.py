@@ -30,6 +30,7 @@ from torchrl_sspl.evaluation.certify import Exit, certify, verify_run
 from torchrl_sspl.modules import FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.modules.agent import Agent, load
 from torchrl_sspl.seeds import spawn
+from torchrl_sspl.sets import Box
 
 
 def residual(net: nn.Sequential, action_scale: float = 2.0) -> LatentDynamics:
@@ -443,3 +444,10 @@ def test_a_search_with_more_time_may_find_more(issued):
     assert Reason.TEXT_CHANGED in found(lambda rows: rest)
     refuted = {"holds": False, "reason": "NOT_INVARIANT", "misses_by": 0.1}
     assert Reason.NUMBERS_CHANGED in found(with_("invariance", **refuted))
+
+
+def test_starts_of_a_state_space_in_rooms_are_of_every_room():
+    env = Line(law=lambda x: torch.where(x > 0.0, 0.95, x))  # in the right room every step leads into U
+    env.state_space = Box([-0.499], [0.0]) | Box([0.0], [0.499])
+    record = certify(line_agent(), env, episodes=200, horizon=1, level=0.0, budget=Budget(boxes=1)).record
+    assert 60 <= record.total.entered <= 140

@@ -147,8 +147,8 @@ def test_blocks_beyond_those_that_the_rule_asks_for_are_refused(kind, asked, eno
     [
         ([(100, 100)], True),
         ([(99, 100)], False),
-        ([(100, 99)], False),
-        ([(100, 0)], True),  # U is not seen: more of the same would not show it
+        ([(100, 99)], True),  # how many show U depends on what the policy does
+        ([(100, 0)], True),
         ([(0, 100)], True),
         ([(0, 0)], True),
         ([(30, 60), (30, 60)], False),
@@ -161,6 +161,27 @@ def test_resets_go_on_while_too_few_count_and_never_look_at_what_happened(blocks
     assert record(blocks=made).complete() == complete
     events = [replace(c, left=c.episodes, events=c.episodes, mistaken=c.shown) for c in made]
     assert record(blocks=events).complete() == complete
+
+
+def test_blocks_of_resets_are_whole_batches():
+    assert [record(envs=k, episodes=n).block for k, n in ((20, 1000), (64, 1000), (64, 3), (7, 50))] == [100, 128, 64, 56]
+
+
+def test_how_many_observations_of_u_were_drawn_where_a_step_enters_it_is_said():
+    # Of 300, 150 are drawn uniformly; where few steps enter U, fewer are added than asked for.
+    for shown, told in ((300, "150 drawn uniformly in U and 150 where"), (162, "150 drawn uniformly in U and 12 where"), (150, "and 0 where")):
+        blocks = [counts(episodes=250, steps=2500, shown=shown - 25), counts(episodes=50, steps=500, shown=25)]
+        layer = statistical_layer(record(kind="states", episodes=300, blocks=blocks))
+        assert told in layer["unsafe observations"].text
+        assert layer["seed"].kind == "assumed"
+        assert "seed of all this, 7," in layer["seed"].text
+
+
+def test_a_premise_that_nothing_watches_is_not_called_watched():
+    given = record(blocks=[counts(episodes=100, steps=1000, shown=100)])
+    texts = [run_time_layer(given, 0.1, held, watched)["premise"].text for held in (False, True) for watched in (True, False)]
+    assert [text.startswith("the premise, watched at run time: ") for text in texts] == [True, False, True, False]
+    assert all("which nothing watches" in text for text in texts[1::2])
 
 
 def test_seeds_of_blocks_are_all_different_and_of_their_purposes():

@@ -394,7 +394,7 @@ def test_measuring_all_again_fails_where_nothing_can_be_measured(tmp_path):
     certify(agent, Line(), name="line", episodes=20, horizon=2, acceptable=0.4, confidence=0.8, budget=SHORT).save(tmp_path / "certificate.json")
     lines: list[str] = []
     assert verify_run(tmp_path, report=lines.append) == Exit.HOLDS
-    assert any("at most 40 %, all of them together with 80 % confidence" in line for line in lines)
+    assert any("at most 40 %: the two of the statistical layer together, and that of the run-time layer by itself, with 80 % confidence" in line for line in lines)
     assert verify_run(tmp_path, measure=True, report=lines.append) == Exit.UNMEASURED
     assert "NOT_MEASURED: its system was given in code" in lines[-1]
     assert verify_run(tmp_path, env=Line(), measure=True, report=lines.append) == Exit.HOLDS

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 import torch
+from analytic import Line, line_agent
 from evaluation.systems import Predictor, lane, lane_agent
 
 from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.evaluation.controllers import AgentController, RandomController
 from torchrl_sspl.evaluation.episodes import evaluate_episodes, logged, separating_level
 from torchrl_sspl.evaluation.simulation import Episodes, simulate
+from torchrl_sspl.modules.observer import gain_matrix
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 pytestmark = pytest.mark.filterwarnings("ignore::FutureWarning", "ignore::DeprecationWarning")
@@ -70,3 +74,24 @@ def test_the_level_keeps_held_out_observations_of_U_outside():
     # With a reserve: to the middle between S and U, no lower than the reserve unless U asks for it, and not for nothing.
     for safe, unsafe, level in ((-0.2, 0.1, -0.05), (-0.4, 0.1, -0.1), (-0.4, -0.2, -0.22), (0.1, 0.2, 0.0), (0.1, 0.01, -0.01)):
         assert separating_level([episodes([safe, unsafe], [SAFE, UNSAFE])], 0.02, 0.1) == pytest.approx(level)
+
+
+def test_an_agent_in_float64_is_measured_as_in_float32():
+    sizes = EvaluationConfig(episodes=4, envs=4, horizon=3)
+    one, two = (evaluate_episodes(agent, Line, sizes) for agent in (line_agent(), line_agent().double()))
+    assert two["starts_inside"] == one["starts_inside"]
+    assert two["unsafe_called_safe"] == one["unsafe_called_safe"]
+
+
+def test_a_picture_of_u_that_looks_safe_counts_although_the_memory_knows_better():
+    agent = line_agent()
+    agent.gain = gain_matrix(0.1, 2)  # what is remembered counts more than the picture
+    # At the end of the line the camera shows the middle; the memory knows where the way to it led.
+    env = partial(Line, shown=lambda x: torch.where(x.abs() > 0.999, 0.0, x))
+    found = evaluate_episodes(agent, env, EvaluationConfig(episodes=50, envs=50, horizon=4))
+    own, chance = found.arrays["own"], found.arrays["chance"]
+    both = own.joined(chance)
+    unsafe = (both.region == UNSAFE) & both.alive
+    events = (unsafe & ((both.barrier <= 0) | (both.seen <= 0))).any(0)
+    assert int(events.sum()) > int((unsafe & (both.barrier <= 0)).any(0).sum())
+    assert found["unsafe_called_safe"] == pytest.approx(float(events[unsafe.any(0)].float().mean()))

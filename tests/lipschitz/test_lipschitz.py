@@ -365,3 +365,9 @@ def test_bad_options_are_errors():
             lmi_barrier(**options)
     with pytest.raises(ShapeError, match=r"\(5, 2\)"):
         lmi_barrier()(torch.zeros(5, 2))
+
+
+def test_gradients_are_taken_in_the_numbers_of_the_weights():
+    net = nn.Sequential(nn.Linear(2, 4), nn.ReLU(), nn.Linear(4, 1))
+    single = lipschitz_lower(net, -1.0, 1.0, 50, generator())
+    assert lipschitz_lower(net.double(), -1.0, 1.0, 50, generator()) == pytest.approx(single, rel=1e-5)

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Problem
 from torchrl_sspl.certification.floating import largest_rounding, more_than, rounding_bound
-from torchrl_sspl.certification.graph import Graph
+from torchrl_sspl.certification.graph import Affine, Graph
 from torchrl_sspl.direction import Direction, direction_of, lifted, within
 from torchrl_sspl.errors import ConfigError, StructureError
 from torchrl_sspl.lipschitz import lipschitz_upper
@@ -141,7 +141,8 @@ def closed_loop(
     their weights and what they compute is refused.
 
     Args:
-        barrier: ``nn.Sequential`` of linear layers and activations (or one with ``collapse()``), p inputs, 1 output.
+        barrier: ``nn.Sequential`` of linear layers and activations (or one with ``collapse()``), p inputs, 1 output, the first a
+            linear layer.
         dynamics: module in the form above (``modules.LatentDynamics``), or a plain ``nn.Sequential`` of ``(z, u)``,
             p + m inputs and p outputs, taken as it is. Either takes the action in physical units.
         policy: module in the form above (``modules.Policy``), or a plain ``nn.Sequential``, p inputs and m outputs.
@@ -178,6 +179,8 @@ def closed_loop(
     direction = direction_of(dynamics) if FORMS.get(type(dynamics)) == "residual" else None
     behind = Graph(latent_dim)
     behind.network(0, barrier)
+    if not isinstance(behind.steps[1], Affine):  # what the barrier reads is moved by an error in linear layers alone
+        raise StructureError("expected the barrier to start with a linear layer, received an activation; put an nn.Linear before it")
     if direction is not None:
         corners = _chart_of(direction, corners)
     of_chart = latent_dim if direction is None else latent_dim - 1
@@ -331,8 +334,11 @@ def evaluation_rounding(system: ClosedLoop, *, unit: float = 2.0**-53, per_axis:
     r"""How far an evaluation of :math:`B(d(z, \pi(z)))` with a unit roundoff can be from the exact one, barrier units.
 
     With the unit of float64 it has to lie far below the slack by which bounds decide. With that of float32 it is a
-    worst case that real evaluations come nowhere near. The domain is bounded in ``per_axis`` pieces per dimension.
+    worst case that real evaluations come nowhere near. The domain is bounded in ``per_axis`` pieces per dimension, in
+    fewer where there would be more than 65,536.
     """
+    while per_axis > 1 and per_axis**system.latent_dim > 65_536:
+        per_axis -= 1
     corners = zip(system.low, system.high, strict=True)
     edges = [torch.linspace(float(a), float(b), per_axis + 1, dtype=torch.float64) for a, b in corners]
     ends = ([e[:-1] for e in edges], [e[1:] for e in edges])

@@ -115,7 +115,7 @@ class Record:
         episodes: asked for.
         horizon: longest episode, in steps.
         envs: environments side by side ("resets").
-        confidence: c of all bounds together.
+        confidence: c, of the two bounds of the statistical layer together, and of that of the run-time layer by itself.
         acceptable: risk above which a statement does not hold.
         used: seeds with which anything was trained, chosen or tuned; None where nobody has recorded them.
         blocks: counts, block by block.
@@ -158,7 +158,9 @@ class Record:
     @property
     def block(self) -> int:
         """Episodes per block."""
-        return min(self.episodes, 250) if self.kind == "states" else max(self.envs, min(self.episodes, 100))
+        if self.kind == "states":
+            return min(self.episodes, 250)
+        return self.envs * -(-min(self.episodes, 100) // self.envs)  # whole batches: resets may come part by part
 
     def size(self, index: int) -> int:
         """Episodes to draw in a block; the last one of "states" takes the rest."""
@@ -168,15 +170,16 @@ class Record:
         """Whether the blocks are as many as the rule asks for, which looks at how many count, never at what happened.
 
         With starts of a known state space: as many as were asked for, one if the set is empty. From resets: at least
-        that many, up to three times as many while fewer than asked for, but some, begin in the set or show U.
+        that many, up to three times as many while fewer than asked for, but some, begin in the set. How many show U is not
+        asked: that depends on what the policy did.
         """
         drawn, blocks = len(self.blocks) * self.block, self.blocks
         if not blocks or self.kind == "states":
             return bool(blocks) and (drawn >= self.episodes or blocks[0].episodes == 0)
         if drawn < self.episodes:
             return False
-        total = self.total
-        return drawn >= 3 * self.episodes or all(n == 0 or n >= self.episodes for n in (total.episodes, total.shown))
+        begun = self.total.episodes
+        return drawn >= 3 * self.episodes or begun == 0 or begun >= self.episodes
 
     def seeds(self) -> list[int]:
         """Seeds of the blocks."""

@@ -152,9 +152,10 @@ def statistical_layer(record: Record) -> Layer:
     )
     _share(layer, "episodes", text, events, n, each, record.acceptable, reason, detail)
     if record.kind == "states":
-        what = "observations of U with B <= s, drawn half uniformly in U and half where one step under a random action "
-        what += "enters it"
-        started = "uniformly in the states whose observation lies in the set"
+        uniform = min(sum(n - n // 2 for n in map(record.size, range(len(record.blocks)))), total.shown)
+        what = f"observations of U with B <= s, {uniform} drawn uniformly in U and {total.shown - uniform} where one step under a random "
+        what += "action enters it"
+        started = "uniformly (in a union: in equal shares of its parts) in the states whose observation lies in the set"
     else:
         what = "episodes with an observation of U that show one with B <= s, half under the policy, half under random "
         what += "actions"
@@ -165,6 +166,7 @@ def statistical_layer(record: Record) -> Layer:
     text = "both bounds hold at once (each bounds a share of its own kind; they are not added)"
     layer.state(REPORTED, "together", text, confidence=record.confidence)
     _errors(layer, record)
+    layer.state(ASSUMED, "seed", f"the seed of all this, {record.seed}, was not chosen by what was measured with it")
     layer.state(ASSUMED, "starts", f"episodes start as the measured ones did: {started}")
     layer.state(ASSUMED, "system", "camera, physics and appearance stay as they were")
     return layer
@@ -212,7 +214,7 @@ def _share(
     layer.state(MEASURED, name, text, holds, why, misses_by=None if holds else bound - acceptable, **of)
 
 
-def run_time_layer(record: Record, tolerated_error: float | None, held: bool = False) -> Layer:
+def run_time_layer(record: Record, tolerated_error: float | None, held: bool = False, watched: bool = True) -> Layer:
     r"""To how many real episodes the proof applies, whatever camera and physics did in them.
 
     The premise at a step: :math:`B(E(o_t)) \le s`, and, unless corrections are held in the set,
@@ -224,6 +226,8 @@ def run_time_layer(record: Record, tolerated_error: float | None, held: bool = F
         record: how the episodes were drawn, and what was counted.
         tolerated_error: :math:`\delta`, proved, latent units; None where nothing is.
         held: whether a correction that would leave the set is cut to :math:`\delta`.
+        watched: whether the agent's monitor compares errors with :math:`\delta`; one that names no tolerated error has nothing to
+            compare with.
 
     Source: Theorem F of ``docs/theory.md``; none in the paper.
 
@@ -252,14 +256,15 @@ def run_time_layer(record: Record, tolerated_error: float | None, held: bool = F
     text = f"steps at which its premise is met: {total.steps - total.uncovered} of {total.steps}; steps are dependent, so no bound follows"
     layer.state(REPORTED, "steps covered", text, n=total.steps)
     limit = down(tolerated_error)
+    premise = "the premise, watched at run time" if watched else "the premise, which nothing watches, as the agent names no error that it tolerates"
     if held:
         text = (
-            f"the premise, watched at run time: B <= s for every observation by itself; the memory keeps B <= s whatever is seen, "
+            f"{premise}: B <= s for every observation by itself; the memory keeps B <= s whatever is seen, "
             f"as a correction that would leave the set is cut to {limit}, which is proved to be tolerated"
         )
     else:
         text = (
-            f"the premise, watched at run time: no error of a step is above {limit}, and B <= s for every observation by "
+            f"{premise}: no error of a step is above {limit}, and B <= s for every observation by "
             "itself; while it is met, B <= s whatever camera and physics do"
         )
     layer.state(ASSUMED, "premise", text)

@@ -264,7 +264,7 @@ class SafetyEnv(EnvBase):
         return self._output(previous)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        action = tensordict["action"].reshape(-1, self.action_dim)
+        action = tensordict["action"].reshape(-1, self.action_dim).to(torch.float32)  # as the state, whatever computes actions
         self._state = self.wrap(self.dynamics(self._state, action))
         previous, self._frame = self._frame, self.draw(self._state)
         self._steps = self._steps + 1

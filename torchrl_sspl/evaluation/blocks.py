@@ -236,7 +236,7 @@ class StateBlocks:
         """Uniform states whose observation lies in the set, and their latents."""
         states, latents, found = [], [], 0
         for tried in range(1, 61):
-            state = self.env.sample_states(2 * n, g, region=self.env.state_space)
+            state = self._anywhere(2 * n, g)
             latent = self._see(None, state)
             kept = self.agent.barrier(latent)[:, 0] <= self.level
             states.append(state[kept])
@@ -246,11 +246,15 @@ class StateBlocks:
                 break
         return torch.cat(states)[:n], torch.cat(latents)[:n]
 
+    def _anywhere(self, n: int, g: torch.Generator) -> Tensor:
+        """States of the state space, of which a part is a sample, too: those of a union are not grouped."""
+        return self.env.state_space.shuffled(n, generator=g, device=g.device).to(self.env.device)
+
     def _entering(self, n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
         """States of U that one step under a uniform random action leads into, and the states before it."""
         env, before, after, found = self.env, [], [], 0
         for _ in range(60):
-            state = env.sample_states(max(4 * n, 2000), g, region=env.state_space)
+            state = self._anywhere(max(4 * n, 2000), g)
             moved = env.wrap(env.dynamics(state, _random_actions(env, len(state), g)))
             enters = (env.region(state) != UNSAFE)[:, 0] & (env.region(moved) == UNSAFE)[:, 0]
             before.append(state[enters])

@@ -110,7 +110,7 @@ def certify(
         seed: root of the seeds of the fresh data, which are drawn in a purpose of their own; default: that of the
             agent's configuration.
         used_seeds: seeds with which anything was trained, chosen or tuned, beside those that the agent itself names.
-        confidence: of all bounds together.
+        confidence: of the two bounds of the statistical layer together, and of that of the run-time layer by itself.
         acceptable: risk per episode, and per observation of U, above which a bound does not hold.
         budget: of each search of the deterministic layer.
         progress: show progress bars.
@@ -157,14 +157,14 @@ def certify_on_episodes(
     What the weights prove is the same as with :func:`certify`. What is measured are episodes from the environment's own
     resets, half under the policy, half under random actions: those under the policy that start in the set, and of all
     that show U, whether one observation of it has B <= s. Episodes are drawn in blocks, each from a newly made and
-    seeded environment, until there are enough of both; when to stop depends on their numbers alone, never on what
+    seeded environment, until enough begin in the set; when to stop depends on that number alone, never on what
     happened in them. Source: paper Theorem 1; deviation: as for :func:`certify`.
 
     Args:
         agent: frozen agent.
         make_env: ``(batch_size=[k], seed=...) -> environment`` with ``"pixels"`` and ``"region"``.
-        episodes: number of fresh episodes from the set, and of fresh episodes that show U. At least as many are drawn
-            under the policy, and under random actions, and at most three times as many.
+        episodes: number of fresh episodes from the set. At least as many are drawn under the policy, and under random actions,
+            and at most three times as many.
         envs: environments stepped together.
         name, level, horizon, seed, used_seeds, confidence, acceptable, budget, progress: as for :func:`certify`.
 
@@ -357,7 +357,7 @@ def _tolerated(certificate: Certificate, agent: Agent) -> float | None:
 def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> dict[str, Layer]:
     return {
         "statistical": statistical_layer(record),
-        "run-time": run_time_layer(record, _tolerated(certificate, agent), holds_at(agent, certificate.level)),
+        "run-time": run_time_layer(record, _tolerated(certificate, agent), holds_at(agent, certificate.level), agent.tolerated_error > 0.0),
         "paper": paper_layer(record, agent.lipschitz_bound, chooses=isinstance(agent.policy, ChoosingPolicy)),
     }
 
@@ -562,7 +562,7 @@ def _print(claimed: Certificate, unmeasured: str, report: Callable[[str], None])
             report(_line(s, proof or not unmeasured))
     if claimed.record is not None:
         limits = 100 * claimed.record.acceptable, 100 * claimed.record.confidence
-        report(f"A bound on a risk holds here if it is at most {limits[0]:g} %, all of them together with {limits[1]:g} % confidence")
+        report(f"A bound on a risk holds here if it is at most {limits[0]:g} %: the two of the statistical layer together, and that of the run-time layer by itself, with {limits[1]:g} % confidence")
     report(f"OK: the weights are {claimed.weights[:12]}..., and the certificate says what they prove")
     if unmeasured and claimed.record is not None:
         report("What is printed as claimed was not checked again; that its words and bounds follow from its counts was")

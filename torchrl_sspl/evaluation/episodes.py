@@ -95,8 +95,9 @@ def evaluate_episodes(
 def _labels(out: Evaluation, episodes: Episodes) -> None:
     """How often the barrier errs about a labelled observation, by episodes and by observations."""
     inside = episodes.barrier <= 0
+    looks_safe = inside if episodes.seen is None else inside | (episodes.seen <= 0)  # by what was remembered, or by the picture alone, as certificates count
     for name, code in _CALLED.items():
-        labelled, wrong = (episodes.region == code) & episodes.alive, inside if code == UNSAFE else ~inside
+        labelled, wrong = (episodes.region == code) & episodes.alive, looks_safe if code == UNSAFE else ~inside
         label, n = "U" if code == UNSAFE else "S", int(labelled.sum())
         events, shown = (labelled & wrong).any(0), labelled.any(0)
         out.count(name, events, f"episodes with an observation of {label}", shown)

@@ -81,7 +81,7 @@ def lipschitz_lower(
     with torch.enable_grad():
         for _ in range(3):
             x = x.detach().requires_grad_()
-            norm = torch.autograd.grad(function(x.to(weight.device)).sum(), x)[0].norm(dim=-1)
+            norm = torch.autograd.grad(function(x.to(weight)).sum(), x)[0].norm(dim=-1)
             best = max(best, float(norm.max()))
             # A piecewise linear function: a look around the steepest pieces beats more samples everywhere.
             steepest = x.detach()[norm.topk(max(1, n // 20)).indices]
