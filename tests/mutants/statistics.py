@@ -11,6 +11,7 @@ _FILES = "tests/certification/test_malformed.py"
 MALFORMED = f"{_FILES}::test_a_malformed_file_is_no_certificate"
 NESTED = f"{_FILES}::test_nesting_is_refused_before_anything_is_parsed"
 CLAIMS = f"{FORGED}::test_a_forgery_with_a_fitting_digest_is_refused"
+MORE_THAN_PROVED = f"{FORGED}::test_an_agent_that_tolerates_more_than_is_proved_says_so_or_is_refused"
 EARLY = f"{FORGED}::test_a_step_may_be_rounded_away_only_where_episodes_end_early"
 STEPS = f"{LOOPS}::test_events_are_those_of_every_single_step"
 
@@ -97,12 +98,15 @@ MUTANTS = [
     (CERTIFICATE, "a.value <= b.value * (1.0 + 1e-9):\n        return []", "a.value <= b.value * 1.01:\n        return []", CLAIMS),
     (CERTIFICATE, "any(limit < a.value for limit in said)", "False", CLAIMS),
     (CERTIFICATE, "any(x < 0.9 * y for x, y in", "any(False for x, y in", CLAIMS),
-    (CERTIFICATE, "if a.value <= 0.0 or a.misses_by", "if a.misses_by", CLAIMS),
+    (CERTIFICATE, "if not a.holds or a.misses_by", "if a.misses_by", CLAIMS),
+    (CERTIFICATE, "a.value >= required and a.value > 0.0", "a.value > 0.0", MORE_THAN_PROVED),
+    (CERTIFICATE, "max(required - a.value, 0.0)", "max(-a.value, 0.0)", MORE_THAN_PROVED),
+    (CERTIFICATE, "or not _bounds_are_all_there(mine)", "", MORE_THAN_PROVED),
     (CERTIFICATE, "return [] if same else", "return [] if True else", CLAIMS),
     (CERTIFICATE, "not _EFFORT.fullmatch(a.detail) or ", "", CLAIMS),
     (CERTIFICATE, "elif b.holds is False and not _gave_up(b):", "elif False:", f"{FORGED}::test_a_refutation_replaced_by_undecided_is_refused"),
     (CERTIFICATE, "elif b is None or (_gave_up(b) and not _gave_up(a)):", "elif b is None:", f"{LOOPS}::test_a_slow_machine_that_verifies_says_that_the_time_was_short"),
-    (CERTIFICATE, "    if not named:\n", "    if False:\n", CLAIMS),
+    (CERTIFICATE, "    if not named or not _bounds_are_all_there(mine):\n", "    if False:\n", CLAIMS),
     (CERTIFICATE, "if f.name not in (\"value\", \"misses_by\", \"confidence\")]", "if f.name in (\"name\", \"kind\")]", CLAIMS),
     (CERTIFICATE, "for k in (\"value\", \"misses_by\", \"confidence\") if not", "for k in (\"misses_by\",) if not", CLAIMS),
     (CERTIFICATE, "rel_tol=1e-9, abs_tol=1e-15", "rel_tol=1e-2, abs_tol=1e-15", CLAIMS),
