@@ -280,6 +280,7 @@ def test_from_words_to_report_and_evaluated_again(tmp_path, capsys):
     assert str(tmp_path) not in Path(tmp_path / "run" / "agent" / "agent.json").read_text()
 
 
+@pytest.mark.slow
 def test_gymnasium_and_an_encoder_by_import_paths(tmp_path, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     (tmp_path / "my_cart.py").write_text(

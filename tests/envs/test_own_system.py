@@ -91,7 +91,7 @@ def small_agent(env) -> Agent:
 
 
 @pytest.mark.filterwarnings("ignore:imageio-ffmpeg")
-@pytest.mark.parametrize("what", ["agent", "controller"])
+@pytest.mark.parametrize("what", ["agent", pytest.param("controller", marks=pytest.mark.slow)])
 def test_evaluation_metrics_and_report_take_it_as_any_other(env, kernel, what, tmp_path):
     pytest.importorskip("matplotlib")
     from torchrl_sspl.experiments.report import write_run_report

@@ -132,6 +132,7 @@ def test_a_size_that_is_none_is_refused():
         CMUTwoDiscsEnv(image_size=0)
 
 
+@pytest.mark.slow
 def test_the_recommended_settings_begin_a_training_and_its_agents_are_measured(tmp_path):
     config = compose(["env=two_discs", "env.image_size=32", "network.pool_to=32", "preset=smoke", "logger=none", f"out_dir={tmp_path}"])
     experiment = Experiment(config)

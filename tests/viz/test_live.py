@@ -195,6 +195,7 @@ def test_the_command_says_where_to_look_and_what_is_wrong(capsys):
     assert "ConfigError" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_the_quadruped_is_watched_in_full_physics():
     pytest.importorskip("pybullet")
