@@ -41,6 +41,7 @@ def test_there_are_a_hundred_and_few_that_live():
     assert all(len(m[4]) > 40 for m in explained)
 
 
+@pytest.mark.slow
 def test_the_command_kills_a_mutant_and_says_so():
     number = next(i for i, m in enumerate(run.read("statistics")) if m[3].endswith("test_seeds.py"))  # quick tests
     result = subprocess.run([sys.executable, RUN, "statistics", "--only", str(number)], capture_output=True, text=True, check=False)

@@ -25,6 +25,7 @@ def benchmark():
     return module
 
 
+@pytest.mark.slow
 def test_the_nominal_policy_reaches_goals_and_hits_what_it_does_not_know(benchmark):
     env = CMUTwoDiscsEnv([1], image_size=32)
     start = torch.tensor([[-1.2, 0.0, 0.0, 0.0], [-1.2, 0.6, 0.0, 0.5], [-1.2, -0.6, 0.0, -0.5]])

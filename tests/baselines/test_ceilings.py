@@ -63,6 +63,7 @@ def test_a_lighter_weight_of_the_speed_claims_more_and_fails(pendulum):
     assert gentle["claimed_harmless_enter"] < 0.1
 
 
+@pytest.mark.slow
 def test_the_margin_of_the_box_claims_everything_and_keeps_nothing(pendulum):
     found = measured(pendulum, "box_margin", grid=201)
     assert found["claimed_over_kernel"] == 1.0
@@ -78,6 +79,7 @@ def test_the_ellipsoid_calls_nothing_safe_falsely_and_is_kept(pendulum):
     assert found["claimed_harmless_enter"] == found["claimed_adversarial_enter"] == 0.0
 
 
+@pytest.mark.slow
 def test_noise_on_the_state_breaks_a_perfect_filter(pendulum):
     assert 0.005 < measured(pendulum, "depth", "noise=[0.007,0.016]", grid=41, horizon=200, episodes=300)["claimed_harmless_enter"] < 0.2
     assert measured(pendulum, "depth", "noise=[0.02,0.1]", grid=41, horizon=200, episodes=50)["claimed_harmless_enter"] > 0.9

@@ -53,7 +53,7 @@ def systems():
     }
 
 
-@pytest.mark.parametrize("task", ["pendulum", "dubins"])
+@pytest.mark.parametrize("task", ["pendulum", pytest.param("dubins", marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", TINY)
 def test_every_method_learns_acts_and_is_scored(name, task, systems):
     env, kernel, data = systems[task]
@@ -130,6 +130,7 @@ def test_the_same_seed_learns_the_same(name, systems):
     assert torch.equal(*values)
 
 
+@pytest.mark.slow
 def test_the_shipped_agent_is_a_row_with_its_memory(systems):
     env, kernel, _ = systems["pendulum"]
     for options in (["agent=pendulum"], ["agent=pendulum", "filter=true"]):

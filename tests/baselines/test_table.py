@@ -90,6 +90,7 @@ def test_a_failure_is_filmed_from_a_start_that_is_claimed_until_it_is_in_u(tmp_p
     assert failures([safe], tmp_path / "none.mp4") is None
 
 
+@pytest.mark.slow
 def test_cells_side_by_side_are_those_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     words = ["methods=lqr,cone,latent_cbf:autoencoder_steps=1:steps=1", "env=pendulum", "budget=tiny", "score.shifted=0", *SMALL]

@@ -9,12 +9,13 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import Budget, Problem, maximise
+from torchrl_sspl.certification.conditions import tolerates
 from torchrl_sspl.certification.floating import rounding_bound
 from torchrl_sspl.certification.graph import Graph
 from torchrl_sspl.certification.half_spaces import clip, programme
 from torchrl_sspl.certification.loop import closed_loop, evaluation_rounding
 from torchrl_sspl.certification.propagation import Enclosure, LinearBound, interval_bounds
-from torchrl_sspl.errors import ConfigError, ShapeError, StructureError
+from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.lipschitz import layers as activations
 from torchrl_sspl.lipschitz.layers import Abs, Relaxation, activation_of, clamp
 
@@ -257,11 +258,15 @@ def test_wrong_shapes_and_unknown_layers_are_refused():
         Budget(boxes=-1)
 
 
-def test_a_barrier_that_begins_with_an_activation_is_refused():
-    # |z| - 0.3 after z+ = 0: an error of 0.9 leaves the set, whatever its activation is bounded by without the error.
-    barrier, plant = nn.Sequential(Abs(), nn.Linear(1, 1)), nn.Sequential(nn.Linear(2, 1))
-    with pytest.raises(StructureError, match=r"put an nn\.Linear before it"):
-        closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+@pytest.mark.parametrize("barrier", [nn.Sequential(Abs(), nn.Linear(1, 1)), nn.Identity()])
+def test_an_error_moves_what_a_barrier_reads_without_a_linear_layer_first(barrier):
+    # |z| - 0.3, or z, after z+ = 0: {B <= level} tolerates errors up to 0.3.
+    plant, level = nn.Sequential(nn.Linear(2, 1)), 0.0 if isinstance(barrier, nn.Sequential) else 0.3
+    nn.utils.vector_to_parameters(torch.zeros(3), plant.parameters())
+    if level == 0.0:
+        nn.utils.vector_to_parameters(torch.tensor([1.0, -0.3]), barrier.parameters())
+    loop = closed_loop(barrier, plant, nn.Sequential(nn.Linear(1, 1)), latent_dim=1, lipschitz_bound=1.0)
+    assert [tolerates(loop, e, level=level, budget=Budget(boxes=2000)).status == "proved" for e in (0.29, 0.31, 0.9)] == [True, False, False]
 
 
 def test_rounding_of_many_latents_is_bounded_in_fewer_pieces():

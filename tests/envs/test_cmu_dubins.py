@@ -116,6 +116,7 @@ def test_an_episode_ends_where_the_car_leaves():
     assert run["next", "region"][0, -1].item() == SAFE
 
 
+@pytest.mark.slow
 def test_the_true_kernel_has_the_share_that_they_report():
     env = CMUDubinsEnv()
     kernel = viability_kernel(env, resolution=(51, 51, 50))
@@ -135,6 +136,7 @@ def test_values_that_are_none_are_refused():
         CMUDubinsEnv(dot_area=-1.0)
 
 
+@pytest.mark.slow
 def test_the_settings_train_this_car_from_its_pictures_alone(tmp_path):
     config = compose(["env=cmu", *(word for word in SINGLE if not word.startswith("env")), "env.image_size=64", "network.pool_to=32", f"out_dir={tmp_path}"])
     experiment = Experiment(config)

@@ -116,6 +116,7 @@ def test_a_goal_is_reached_within_a_fifth_of_a_metre():
         CMUTwoDiscsEnv.reached(at[:, :3])
 
 
+@pytest.mark.slow
 def test_the_true_kernel_has_a_way_through_the_gap_and_does_not_ask_for_the_goal():
     env = CMUTwoDiscsEnv()
     kernel = viability_kernel(env, resolution=(61, 61, 36, 2), actions=torch.tensor([[-2.0], [0.0], [2.0]]))

@@ -53,6 +53,7 @@ def test_the_example_is_at_most_forty_lines(name):
     assert sum(bool(line) and not line.startswith("#") for line in lines) <= 40
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FILES)
 def test_from_the_simulator_to_the_report(name, example, tmp_path, monkeypatch):
     module = example(name)

@@ -15,6 +15,7 @@ from torchrl_sspl.modules.agent import load
 DEPLOY = Path(__file__).resolve().parents[2] / "examples" / "deploy"
 
 
+@pytest.mark.slow
 def test_a_process_without_torch_runs_a_film(tmp_path):
     onnx_file = load("pendulum").export(tmp_path / "pendulum.onnx", check=16)
     iio = pytest.importorskip("imageio.v3")

@@ -39,6 +39,7 @@ def test_the_example_learns_behind_the_filter_without_entering_u(tmp_path, capsy
     assert "| without | with the filter |" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_who_heads_straight_for_the_goal_arrives_behind_the_filter_and_drives_into_the_obstacle_without_it(example):
     task = example["TASKS"]["car"]
     task.longest = 70

@@ -100,6 +100,7 @@ def test_pictures_that_an_interrupted_report_has_drawn_are_not_drawn_again(tmp_p
     assert drawn == [4, 5]
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_the_robot_hits_without_protection_and_passes_with_it_in_25_pictures_a_second():
     pytest.importorskip("pybullet")

@@ -96,6 +96,7 @@ def walked(n: int, steps: int = 4, size: int = 16) -> Episodes:
     return Episodes(torch.zeros(steps, n, 1), region, alive, states, torch.zeros(steps + 1, n), frames=frames, events=events)
 
 
+@pytest.mark.slow
 def test_the_car_is_shown_by_heading_and_its_walks_from_its_own_description(tmp_path):
     env = DubinsEnv(image_size=32, yaw_lag=YAW_LAG, seed=0)  # trained on a car that turns late, evaluated on its twin
     twin, found = env.known_twin(), Evaluation()
@@ -152,6 +153,7 @@ def test_what_acts_without_a_barrier_gets_a_report_of_what_can_be_measured(pendu
     assert list(draw_figures(bare, None)) == ["Training"]
 
 
+@pytest.mark.slow
 def test_without_a_training_there_are_no_curves_and_no_claims(pendulum, tmp_path):
     agent, env, _, found = pendulum
     outcome = outcome_of(tmp_path, agent, env, {"own": found})

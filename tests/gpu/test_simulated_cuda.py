@@ -19,6 +19,7 @@ HERE = Path(__file__).parent
 WITH_A_GPU = sorted(str(path) for path in HERE.parent.rglob("test_*.py") if "mark.gpu" in path.read_text())
 COMPILER = os.environ.get("CXX") or shutil.which("c++")
 pytestmark = [
+    pytest.mark.slow,
     pytest.mark.skipif(COMPILER is None, reason="needs a C++ compiler"),
     pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU: run the tests marked gpu on it"),
     pytest.mark.skipif(torch.version.cuda is not None, reason="functions of a torch that is built for a GPU are not replaced"),

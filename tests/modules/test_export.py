@@ -128,6 +128,7 @@ def test_all_that_comes_out_is_checked(programme, monkeypatch, name, changed):
         _compare(DeployedStep(load("pendulum")), programme, ".pt2", 256)
 
 
+@pytest.mark.slow
 def test_a_file_that_is_refused_does_not_replace_one_that_is_right(tmp_path, monkeypatch):
     agent, path = load("pendulum"), tmp_path / "agent.pt2"
     agent.export(path, check=8)

@@ -38,6 +38,7 @@ def test_another_process_draws_the_same_pictures_of_every_job_in_whatever_order_
         there.follow(bodies, 0.02)
 
 
+@pytest.mark.slow
 def test_what_goes_wrong_in_the_other_process_is_raised_where_the_pictures_are_asked_for(bodies):
     wrong = StageProcess(48, obstacle_shape="heart")
     with pytest.raises(ConfigError, match="heart"):

@@ -34,6 +34,7 @@ def test_entries_are_counted_from_alarms_premise_and_regions(benchmark):
     assert benchmark.told(run, watching, 3) == "3 | 1 | 1 / 1 / 1 | 3 of 4 | 1 | 1 | -"
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_walks_have_rows_for_the_faults_of_camera_and_world(benchmark, monkeypatch, capsys):
     pytest.importorskip("pybullet")

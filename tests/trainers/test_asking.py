@@ -158,6 +158,7 @@ def labelled(z: torch.Tensor, answer: torch.Tensor, count: int, within: int) -> 
     return torch.where(told, answer, UNLABELLED)
 
 
+@pytest.mark.slow
 def test_labels_that_are_as_frequent_everywhere_in_u_tell_where_u_ends():
     z, answer = box()
     region, everywhere = labelled(z, answer, 200, 6000), torch.ones(len(z), dtype=torch.bool)

@@ -158,6 +158,7 @@ def test_a_run_that_gets_no_processor_does_not_hang(monkeypatch):
         run.wait()
 
 
+@pytest.mark.slow
 @pytest.mark.pybullet
 def test_simulators_end_with_what_began_them(tmp_path):
     pybullet = pytest.importorskip("pybullet")

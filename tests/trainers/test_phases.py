@@ -332,6 +332,7 @@ def test_inside_the_phases_checkpoints_hold_no_pictures(tmp_path):
     assert "replay_buffer" not in held
 
 
+@pytest.mark.slow
 def test_another_seed_gives_another_agent(tmp_path, uninterrupted):
     other = experiment(tmp_path, "seed=1").train()
     with pytest.raises(AssertionError):
@@ -432,6 +433,7 @@ def test_a_retry_draws_fresh_weights_only_where_nothing_has_passed():
     assert len(set(seen)) == 4
 
 
+@pytest.mark.slow
 def test_retries_resume_exactly_and_end_when_one_passes(tmp_path, monkeypatch):
     answers = {0: False, 1: False, 2: True}
 

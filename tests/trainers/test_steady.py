@@ -52,6 +52,7 @@ def moved(encoder, other, frames, changed) -> float:
     return float((encoder(changed) - other(frames)).square().mean().sqrt())
 
 
+@pytest.mark.slow
 def test_changes_move_latents_less_afterwards_and_unchanged_pictures_are_seen_as_before():
     changes = Augmentation(share=1.0, noise=60.0, brightness=0.0, shift=0.0)
     work = workspace(changes=changes, steady_steps=150)

@@ -153,6 +153,7 @@ def test_values_between_latents_are_those_of_a_plane():
     assert float(between.max()) <= 0.0
 
 
+@pytest.mark.slow
 def test_values_on_a_cloud_are_the_kernel_of_a_car_that_is_known_exactly():
     env, random = CMUDubinsEnv(batch_size=[1], seed=0), torch.Generator().manual_seed(0)
     kernel = viability_kernel(env, resolution=(51, 51, 40))

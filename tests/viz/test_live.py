@@ -163,6 +163,7 @@ def test_whoever_is_slow_receives_the_newest_steps_only():
     assert [e.get("picture") for e in found] == [None] * 299 + ["picture 999"]
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_it_and_the_film_can_be_seen(tmp_path):
     words = ["watch", "pendulum", "--port", "0", "--record", str(tmp_path / "a.mp4")]
     process = subprocess.Popen(

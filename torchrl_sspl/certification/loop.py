@@ -141,8 +141,7 @@ def closed_loop(
     their weights and what they compute is refused.
 
     Args:
-        barrier: ``nn.Sequential`` of linear layers and activations (or one with ``collapse()``), p inputs, 1 output, the first a
-            linear layer.
+        barrier: ``nn.Sequential`` of linear layers and activations (or one with ``collapse()``), p inputs, 1 output.
         dynamics: module in the form above (``modules.LatentDynamics``), or a plain ``nn.Sequential`` of ``(z, u)``,
             p + m inputs and p outputs, taken as it is. Either takes the action in physical units.
         policy: module in the form above (``modules.Policy``), or a plain ``nn.Sequential``, p inputs and m outputs.
@@ -179,8 +178,6 @@ def closed_loop(
     direction = direction_of(dynamics) if FORMS.get(type(dynamics)) == "residual" else None
     behind = Graph(latent_dim)
     behind.network(0, barrier)
-    if not isinstance(behind.steps[1], Affine):  # what the barrier reads is moved by an error in linear layers alone
-        raise StructureError("expected the barrier to start with a linear layer, received an activation; put an nn.Linear before it")
     if direction is not None:
         corners = _chart_of(direction, corners)
     of_chart = latent_dim if direction is None else latent_dim - 1
@@ -193,7 +190,10 @@ def closed_loop(
             f"expected a barrier of one output and dynamics of {latent_dim}, received {alone.output_dim} and {sorted(sizes)}"
         )
     step.side_by_side(found)
-    looped.side_by_side([looped.network(k, barrier) for k in inner])
+    reads = inner
+    if not any(isinstance(step, Affine) for step in behind.steps[1:2]):  # an error moves what linear layers read, and activations would miss it
+        reads = [looped.linear([k], [torch.eye(latent_dim)], roundings=0) for k in inner]
+    looped.side_by_side([looped.network(k, barrier) for k in reads])
     accepted = -float(cast(Tensor, policy.margin)) if chooses else -math.inf
     turns: dict[str, Any] = {} if direction is None else {"direction": direction, "behind": behind}
     return ClosedLoop(alone, step, looped, tuple(inner), float(lipschitz_bound), corners[0], corners[1], accepted, **turns)

@@ -129,15 +129,18 @@ def _about(agent: Any) -> dict[str, Any]:
 
 
 def _period(agent: Any) -> float | None:
-    """Time between two steps in s; None where the agent's description does not say it."""
-    from torchrl_sspl.evaluation.blocks import described_system  # which imports agents
+    """Time between two steps in s; None where the agent's description does not say it, and names no system of this library."""
+    from torchrl_sspl import envs
 
     config = agent.description.get("config")
     named = config.get("env") if isinstance(config, Mapping) else None
     period = named.get("dt") if isinstance(named, Mapping) else None
     if period is None:
-        factory = described_system(agent.description)  # of this library: no code of others is run
-        period = None if factory is None else getattr(factory(batch_size=[1], seed=0), "dt", None)
+        target = named.get("_target_") if isinstance(named, Mapping) else None
+        path = target if isinstance(target, str) else f"torchrl_sspl.envs.{agent.description.get('environment')}"
+        kind = getattr(envs, path.rpartition(".")[2], None) if path.startswith("torchrl_sspl.envs.") else None
+        known = isinstance(kind, type) and issubclass(kind, envs.SafetyEnv) and kind is not envs.SafetyEnv
+        period = getattr(kind(batch_size=[1]), "dt", None) if known else None  # type: ignore[misc, call-arg]
     return float(period) if isinstance(period, (int, float)) else None
 
 
