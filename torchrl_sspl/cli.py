@@ -204,7 +204,7 @@ def evaluate_agent(name_or_path: str, overrides: Sequence[str] = (), *, device: 
         if key in _OF_A_RUN:
             raise ConfigError(
                 f"expected options of what is measured here, received '{key}': walks, other renderers, level and certificate belong to a run; "
-                "an example measures them, too: make quadruped ARGS='agent=quadruped evaluation.walks=20'"
+                "an example measures them, too: make quadruped ARGS='agent=quadruped evaluation.walks=20 out_dir=runs/walks'"
             )
     agent = load(name_or_path, device)
     trained = agent.description.get("config", {})

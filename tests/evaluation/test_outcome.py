@@ -102,3 +102,14 @@ def test_the_same_lies_beside_an_agent_just_trained(tmp_path, trained):
     beside = tmp_path / "agent" / "evaluation.json"
     assert beside.is_file() == trained
     assert not trained or beside.read_text() == path.read_text()
+
+
+def test_few_episodes_without_an_event_are_no_aim_and_what_is_no_number_is_null(tmp_path):
+    few = evaluation(0.7, 0)
+    few.add(share("leave", 0, 20))
+    few.add(Measurement("walks", float("nan"), "share"))
+    found = outcome(tmp_path, evaluations={"own": few})
+    assert found.rows()[1][-1] == "too few episodes"
+    body = json.loads(write_metrics(found).read_text(), parse_constant=pytest.fail)
+    assert body["verdicts"]["episodes that leave"] == "too few episodes"
+    assert body["measurements"]["own"]["walks"]["value"] is None

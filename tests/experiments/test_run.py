@@ -21,7 +21,7 @@ from torchrl_sspl.cli import evaluate_agent
 from torchrl_sspl.configs import compose
 from torchrl_sspl.data.collect import ExploringPolicy
 from torchrl_sspl.envs.gymnasium import GymnasiumPixels
-from torchrl_sspl.errors import CheckpointError, ConfigError
+from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError
 from torchrl_sspl.experiments.description import describe, differences
 from torchrl_sspl.experiments.own_systems import advice
 from torchrl_sspl.experiments.run import Experiment, run_experiment
@@ -348,3 +348,28 @@ def test_environments_without_labels_are_refused(tmp_path):
 
     with pytest.raises(ConfigError, match=r"keys pixels and region, found no \['region'\]"):
         Experiment(compose([*SMALL, f"out_dir={tmp_path}"]), unlabelled)
+
+
+def test_a_run_without_checkpoints_is_not_mixed_with_one_that_has_them(tmp_path):
+    words = ["trainer.total_frames=64", "synthesis.enabled=false", "evaluation.calibrate=false", f"out_dir={tmp_path}"]
+    Experiment(compose([*SMALL, *words]), lane).train()
+    other = ["seed=1", UNSAVED]
+    with pytest.raises(CheckpointError, match="seed: 0, now 1"):
+        Experiment(compose([*SMALL, *words, *other]), lane).train()
+    Experiment(compose([*SMALL, *words, *other]), lane).train(resume=False)
+    assert not list((tmp_path / "checkpoints").glob("*"))
+
+
+def test_an_agent_is_not_measured_in_the_folder_of_a_run_that_was_trained(tmp_path):
+    (tmp_path / "agent").mkdir()
+    experiment = Experiment(compose(["env=pendulum", "agent=pendulum", "logger=none", f"out_dir={tmp_path}"]))
+    with pytest.raises(OutputError, match="holds a run that was trained; give another out_dir"):
+        experiment.run()
+
+
+def test_nothing_is_measured_where_that_is_asked_for(tmp_path):
+    words = ["trainer.total_frames=64", "synthesis.enabled=false", "evaluation.calibrate=false", "evaluation.episodes=0", UNSAVED, f"out_dir={tmp_path}"]
+    outcome = Experiment(compose([*SMALL, *words]), lane).run()
+    assert "policy_touch_unsafe" not in outcome.evaluation.measurements
+    assert (tmp_path / "metrics.json").is_file()
+    assert (tmp_path / "report.html").is_file()

@@ -581,3 +581,8 @@ def test_an_error_that_is_to_be_tolerated_is_tolerated_whatever_was_observed(spr
     work = SimpleNamespace(latents=data, config=config, dynamics=lambda z, u: z)
     _, axes = observed_errors(work, z, g, spread)
     torch.testing.assert_close((axes[:, 1:] - axes[:, :1]).norm(dim=-1), torch.full((200, 2), 1.25 * 0.05))
+
+
+def test_a_checkpoint_after_more_phases_than_there_are_is_refused():
+    with pytest.raises(CheckpointError, match=r"expected a checkpoint of these 0 phases, received one after 1; .*evaluation\.calibrate"):
+        Phases([], None).load_state_dict({"done": 1, "begun": False})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -38,6 +39,35 @@ class Requirement:
             return "aim"
         miss = sign * (measured.value - self.must)
         return "must" if miss <= 0 else f"missed by {miss:.3g}"
+
+
+def bounded(requirement: Any, verdict: str, measurement: Any) -> str:
+    """A verdict "aim" or "must" stands where the 95 % bound of the measurement reaches the must too.
+
+    Else it is "none seen" (or "all seen") of what no bound of a sample can reach, and "too few episodes" of the rest. Nodes of a
+    grid are no sample: without a bound a verdict stands, but that none of some nodes is a fault says nothing of what lies between.
+
+    Source: none.
+
+    Example:
+        >>> from types import SimpleNamespace
+        >>> few, many = SimpleNamespace(lower=0.0, upper=0.06), SimpleNamespace(lower=0.0, upper=0.0009)
+        >>> rule = SimpleNamespace(sense="<=", must=0.001)
+        >>> bounded(rule, "aim", few), bounded(rule, "aim", many)
+        ('too few episodes', 'aim')
+    """
+    upward = requirement.sense == "<="
+    bound = getattr(measurement, "upper" if upward else "lower", None)
+    if not verdict.startswith(("aim", "must")):
+        return verdict
+    if bound is None or math.isnan(bound):
+        if getattr(measurement, "unit", "") != "share" or requirement.must != (0.0 if upward else 1.0):
+            return verdict
+    elif (bound <= requirement.must) if upward else (bound >= requirement.must):
+        return verdict
+    if requirement.must == (0.0 if upward else 1.0):
+        return "none seen" if upward else "all seen"
+    return "too few episodes"
 
 
 @dataclass(frozen=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, is_dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 from torchrl_sspl.certification.certificate import Certificate
 from torchrl_sspl.configs.schema import Config
-from torchrl_sspl.envs.system import System
+from torchrl_sspl.envs.system import System, bounded
 from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
 from torchrl_sspl.files import write
 from torchrl_sspl.modules.agent import Agent
@@ -79,7 +80,7 @@ class Outcome:
         return self.evaluations["own"]
 
     def rows(self) -> list[tuple[str, str, str, str, str]]:
-        """Label, value, must, aim and verdict of every requirement, on own and on other frames."""
+        """Label, value, must, aim and verdict of every requirement, on own and on other frames; as the report says it."""
         table = []
         for where, evaluation in self.evaluations.items():
             for r in () if self.system is None else self.system.requirements:
@@ -89,7 +90,7 @@ class Outcome:
                 label = r.label if where == "own" else f"{r.label}, {where} frames"
                 bound = None if m is None else m.upper if r.sense == "<=" else m.lower
                 limits = f"{r.sense} {r.must:g}", f"{r.sense} {r.aim:g}"
-                table.append((label, _value(m, bound), *limits, r.verdict(evaluation)))
+                table.append((label, _value(m, bound), *limits, bounded(r, r.verdict(evaluation), m)))
         return table
 
     def measured(self) -> list[str]:
@@ -155,13 +156,22 @@ def write_metrics(outcome: Outcome) -> Path:
         "warnings": outcome.warnings,
         "config": config,
     }
-    text = json.dumps(_without_paths(body), indent=1, sort_keys=True) + "\n"
+    text = json.dumps(_without_paths(_finite(body)), indent=1, sort_keys=True, allow_nan=False) + "\n"
     path = Path(outcome.directory) / METRICS_FILE
     write(path, text)
     beside = path.parent / "agent"
     if outcome.seconds is not None and beside.is_dir():
         write(beside / EVALUATION_FILE, text)
     return path
+
+
+def _finite(value: Any) -> Any:
+    """None for what JSON has no number for."""
+    if isinstance(value, Mapping):
+        return {k: _finite(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def _without_paths(value: Any) -> Any:

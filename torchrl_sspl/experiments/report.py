@@ -197,6 +197,8 @@ def _shown_of(twin: SafetyEnv, paths: Any) -> tuple[Any, Any]:
 
 def _of_episodes(arrays: dict[str, Any], barrier: Any) -> dict[str, Any]:
     """Figures of a system that is known by being run only."""
+    if "own" not in arrays:
+        return {}  # no episode was asked for
     own, chance = arrays["own"], arrays["chance"]
     figures: dict[str, Any] = {}
     both = own.joined(chance)
@@ -220,6 +222,8 @@ def _of_episodes(arrays: dict[str, Any], barrier: Any) -> dict[str, Any]:
 def _film(outcome: Outcome, env: SafetyEnv | None, folder: Path) -> tuple[Path | None, str]:
     """Film of a run and what it shows: in full physics where there was any, on the true dynamics, or as the agent sees it."""
     arrays, path = outcome.evaluations["own"].arrays, folder / "episode.mp4"
+    if env is None and "own" not in arrays:
+        return None, ""
     if env is None:
         return _recorded(arrays["own"], path, "One fresh episode"), "One fresh episode, as the agent sees it."
     twin, e = env.known_twin(), outcome.config.evaluation

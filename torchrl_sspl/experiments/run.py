@@ -29,7 +29,7 @@ from torchrl_sspl.data import Augmentation, Labels, TransitionStore
 from torchrl_sspl.data.collect import ExploringPolicy, RandomActions, make_collector
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import LARGEST_ACTION, SafetyEnv
-from torchrl_sspl.errors import CheckpointError, ConfigError, EmptyRegionError, MissingDependencyError
+from torchrl_sspl.errors import CheckpointError, ConfigError, EmptyRegionError, MissingDependencyError, OutputError
 from torchrl_sspl.evaluation.certify import CERTIFICATE_FILE, certify, certify_on_episodes, premise
 from torchrl_sspl.evaluation.episodes import evaluate_episodes, logged
 from torchrl_sspl.evaluation.known import evaluate
@@ -314,6 +314,8 @@ class Experiment:
         """
         rotation = self.trainer.checkpoint_rotation
         latest = rotation.latest() if rotation is not None else None
+        if resume and rotation is None and any((self.directory / "checkpoints").glob("*")):
+            self._same_run()  # else what goes on later would be the other one
         for half in (self.directory / "checkpoints").glob(".*"):  # of a killed run
             shutil.rmtree(half, ignore_errors=True)
         if resume and latest is not None:
@@ -323,6 +325,8 @@ class Experiment:
             shutil.rmtree(self.directory / FOLDER, ignore_errors=True)
             for path in () if rotation is None else rotation.checkpoints():
                 rotation._remove_atomically(path)
+            if not resume:
+                shutil.rmtree(self.directory / "checkpoints", ignore_errors=True)
             (self.directory / "log.jsonl").unlink(missing_ok=True)
         write(self.directory / CONFIG_FILE, json.dumps(self.config.to_dict(), indent=1, sort_keys=True) + "\n")
         try:
@@ -376,7 +380,7 @@ class Experiment:
         """All measurements of a frozen agent on fresh data: ``"own"``, and those of every further renderer."""
         e, progress = self.config.evaluation, self.config.trainer.progress
         if not self.known:
-            return {"own": evaluate_episodes(agent, self.make_env, e, progress=progress)}
+            return {"own": evaluate_episodes(agent, self.make_env, e, progress=progress) if e.episodes else Evaluation()}
         twin = self.env.known_twin()  # type: ignore[operator]
         found = {"own": evaluate(agent, twin, e, progress=progress) if e.episodes else Evaluation()}
         for name, draw in twin.renderers().items() if e.renderer_episodes else ():
@@ -416,10 +420,13 @@ class Experiment:
         """Train (or load ``config.agent``), evaluate on fresh data, certify, and report.
 
         With ``resume`` a training goes on from a checkpoint in ``config.out_dir``, if there is one. There
-        ``metrics.json``, ``report.html`` and ``agent/`` land. Raises OutputError if another process writes there.
+        ``metrics.json``, ``report.html`` and ``agent/`` land. Raises OutputError if another process writes there, or if a
+        run that was trained is there and ``config.agent`` is to be measured.
         Source: none.
         """
         trained = not self.config.agent
+        if not trained and (self.directory / "agent").is_dir():
+            raise OutputError(f"expected an out_dir for measurements alone, received '{self.directory}', which holds a run that was trained; give another out_dir")
         agent = (self.train(resume=resume) if trained else load(self.config.agent)).to(self.device)
         seconds = self.trainer.clock.seconds  # before anything is measured
         certificate: Certificate | None = None

@@ -21,7 +21,7 @@ from torchrl.trainers import Trainer, TrainerHookBase
 from torchrl_sspl.certification.certificate import weights_digest
 from torchrl_sspl.configs.schema import SynthesisConfig
 from torchrl_sspl.direction import direction_of
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import CheckpointError, ConfigError
 from torchrl_sspl.files import append
 from torchrl_sspl.journal import journal
 from torchrl_sspl.modules.agent import Agent
@@ -508,6 +508,11 @@ class Phases(TrainerHookBase):
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
+        if int(state["done"]) > len(self.phases):
+            raise CheckpointError(
+                f"expected a checkpoint of these {len(self.phases)} phases, received one after {state['done']}; leave what adds phases (evaluation.calibrate, "
+                "synthesis) as it was, or give another out_dir"
+            )
         self.done, self.resumed, self.weights = int(state["done"]), bool(state["begun"]), state.get("weights", [])
         if self.resumed:
             self.work.load_state_dict(state["work"])

@@ -12,12 +12,12 @@ from types import SimpleNamespace
 from typing import Any
 
 from torchrl_sspl.configs.reader import EnvFactory
-from torchrl_sspl.envs.system import Requirement
+from torchrl_sspl.envs.system import Requirement, bounded
 from torchrl_sspl.errors import CheckpointError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.curves import COLOURS, panels, read_log
 from torchrl_sspl.viz.pages import Badge, Cell, Picture, Table, render
-from torchrl_sspl.viz.report import MARKS, SEEN, badge, bounded, file_uri, format_value, verdict_in, verdict_kind
+from torchrl_sspl.viz.report import MARKS, SEEN, badge, file_uri, format_value, verdict_in, verdict_kind
 
 _OWN = ("out_dir", "seed", "trainer.progress", "logger.kind", "logger.project")  # no settings of what is compared
 

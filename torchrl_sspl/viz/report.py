@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from torchrl_sspl.certification.rounding import down, up
+from torchrl_sspl.envs.system import bounded
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.pages import Badge, Cell, Picture, Table, render
@@ -138,33 +139,6 @@ def requirement_rows(requirements: Sequence[Any], evaluation: Any) -> list[tuple
         limits = [f"{'' if v == end else sign + ' '}{format_value(v, unit)}" for v in (r.must, r.aim)]
         rows.append((r.label, m, *limits, verdict_in(unit, bounded(r, r.verdict(evaluation), m))))
     return rows
-
-
-def bounded(requirement: Any, verdict: str, measurement: Any) -> str:
-    """A verdict "aim" or "must" stands where the 95 % bound of the measurement reaches the must too.
-
-    Else it is "none seen" (or "all seen") of what no bound of a sample can reach, and "too few episodes" of the rest. Nodes of a
-    grid are no sample: without a bound a verdict stands, but that none of some nodes is a fault says nothing of what lies between.
-
-    Example:
-        >>> from types import SimpleNamespace
-        >>> few, many = SimpleNamespace(lower=0.0, upper=0.06), SimpleNamespace(lower=0.0, upper=0.0009)
-        >>> rule = SimpleNamespace(sense="<=", must=0.001)
-        >>> bounded(rule, "aim", few), bounded(rule, "aim", many)
-        ('too few episodes', 'aim')
-    """
-    upward = requirement.sense == "<="
-    bound = getattr(measurement, "upper" if upward else "lower", None)
-    if not verdict.startswith(("aim", "must")):
-        return verdict
-    if bound is None or math.isnan(bound):
-        if getattr(measurement, "unit", "") != "share" or requirement.must != (0.0 if upward else 1.0):
-            return verdict
-    elif (bound <= requirement.must) if upward else (bound >= requirement.must):
-        return verdict
-    if requirement.must == (0.0 if upward else 1.0):
-        return "none seen" if upward else "all seen"
-    return "too few episodes"
 
 
 def verdict_in(unit: str, verdict: str) -> str:
