@@ -117,7 +117,9 @@ class Agent(nn.Module):
         if not 0.0 < self.lipschitz_bound < math.inf:
             raise ConfigError(f"expected a Lipschitz bound that is finite and above zero, received {lipschitz_bound}")
         self.description: dict[str, Any] = dict(description or {})
-        self.register_buffer("gain", gain_matrix(gain, self.latent_dim))
+        matrix, dtype = gain_matrix(gain, self.latent_dim), self.barrier[0].weight.dtype
+        given = isinstance(gain, Tensor) and gain.ndim == 2  # a matrix is not rounded to float32 in between
+        self.register_buffer("gain", gain.detach().cpu().to(dtype, copy=True) if given else matrix.to(dtype))
         error = self.description.get("tolerated_error", 0.0)
         if type(error) not in (int, float) or not 0.0 <= error < math.inf:
             raise ConfigError(f"expected a tolerated error that is finite and not negative, received {str(error)[:40]!r}")
