@@ -60,6 +60,7 @@ MALFORMED: dict[str, Callable[[Path, Body], Any]] = {
     "nested objects": raw('{"a":' * 50_000 + "1" + "}" * 50_000),
     "ten megabytes": lambda path, body: path.write_text(path.read_text() + " " * 10_000_000),
     "an integer of ten thousand digits": text_edit('"level": 0.0', f'"level": {"9" * 10_000}'),
+    "an integer of 400 digits": text_edit('"level": 0.0', f'"level": {"9" * 400}'),
     "level NaN": text_edit('"level": 0.0', '"level": NaN'),
     "level Infinity": text_edit('"level": 0.0', '"level": Infinity'),
     "level 1e999": text_edit('"level": 0.0', '"level": 1e999'),

@@ -26,7 +26,7 @@ from torchrl_sspl.evaluation import blocks
 from torchrl_sspl.evaluation import certify as certify_module
 from torchrl_sspl.evaluation.blocks import described_system
 from torchrl_sspl.evaluation.certify import Exit, certify, certify_on_episodes, issue, verify_run
-from torchrl_sspl.modules.agent import Agent, load
+from torchrl_sspl.modules.agent import Agent, load, mlp_barrier
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import Box
 
@@ -284,6 +284,20 @@ def test_an_agent_that_does_not_say_its_seeds_is_told_so():
     assert "does not say" in fresh.text
 
 
+def test_seeds_that_only_the_certificate_names_measure_nothing(tmp_path):
+    agent = line_agent()
+    del agent.description["seeds"]
+    agent.save(tmp_path)
+    certificate = certify(agent, Line(), name="line", episodes=20, horizon=1, used_seeds=[5], budget=SHORT)
+    certificate.save(tmp_path / "certificate.json")
+    assert certificate.record is not None
+    assert certificate.record.used == [5]
+    assert certificate.layers["statistical"]["fresh"].kind == "assumed"
+    assert verify_run(tmp_path, env=Line(), report=lambda line: None) == Exit.HOLDS
+    clash = certify(agent, Line(), episodes=20, horizon=1, used_seeds=[spawn(3, "certificate", 0)], budget=SHORT)
+    assert Reason.CALIBRATION_REUSED in clash.reasons
+
+
 def test_labelled_states_of_the_training_are_found(monkeypatch):
     seen: list[str] = []
     block = blocks.Block
@@ -451,6 +465,40 @@ def test_a_certificate_is_issued_again_with_its_own_settings(tmp_path):
     assert issue(tmp_path).agent == tmp_path.name.replace("[", "_").replace("]", "_")
 
 
+def test_a_spike_in_u_makes_no_start_close():
+    # The barrier rises to 10,000 behind .9: what rounding may move near the level is no larger.
+    agent, signs = line_agent(), torch.tensor([[1.0, 0.0], [-1.0, 0.0]])
+    barrier = mlp_barrier(2, [6])
+    barrier[0].weight.data[:4], barrier[0].weight.data[4:] = agent.barrier[0].weight, signs
+    barrier[0].bias.data[:4], barrier[0].bias.data[4:] = 0.0, -0.9
+    barrier[2].weight.data[0], barrier[2].bias.data[0] = torch.tensor([1.0, 1.0, 1.0, 1.0, 1e5, 1e5]), -0.5
+    spiked = Agent(agent.encoder, agent.dynamics, barrier, agent.policy, 2e5, agent.description)
+    record = Record("resets", "given", 3, 100, 2, 20, used=[])
+    block = blocks.ResetBlocks(spiked, Line, record, 0.0)(0)
+    assert block.close == 0
+    assert float(block.unsafe.max()) > 5000.0
+    more = replace(block.counts, episodes=block.counts.episodes + 1, steps=block.counts.steps + 2)
+    assert "episodes" in blocks.block_changes(more, block, resets=True)
+
+
+def test_where_many_starts_are_close_few_may_be_rounded_away():
+    make = partial(Line, shown=lambda x: torch.where(x > 0.0, 0.5, 0.0))  # B = -7.6e-6 for half of them
+    record = Record("resets", "given", 3, 40, 2, 20, used=[])
+    assert blocks.ResetBlocks(line_agent(), make, record, -7e-6)(0).close == 2
+
+
+def test_networks_in_float64_are_the_same_agent_from_disk(tmp_path):
+    line = line_agent()
+    gain = torch.tensor([[0.9, 0.0], [0.0, 1.0]], dtype=torch.float64)
+    nets = (net.double() for net in (line.encoder, line.dynamics, line.barrier, line.policy))
+    agent = Agent(*nets, 1.5, line.description, gain)
+    assert torch.equal(agent.gain, gain)
+    agent.save(tmp_path)
+    certify(agent, None, name="line", level=0.0, budget=SHORT).save(tmp_path / "certificate.json")
+    lines: list[str] = []
+    assert verify_run(tmp_path, report=lines.append) == Exit.HOLDS, lines
+
+
 # --- which system -----------------------------------------------------------------------------------------------------------
 
 
@@ -494,6 +542,11 @@ def test_resets_are_compared_with_their_description():
     assert blocks.same_resets(partial(Line, initial=0.5), partial(Line, initial=0.5))
     assert not blocks.same_resets(partial(Line, initial=0.5), Line)
     assert not blocks.same_resets(Line, lambda batch_size, seed: object())
+    assert not blocks.same_resets(partial(PendulumEnv, max_torque=5.0), PendulumEnv)
+    assert not blocks.same_resets(partial(PendulumEnv, horizon=3), PendulumEnv)
+    assert blocks.same_resets(partial(PendulumEnv, horizon=4), partial(PendulumEnv, horizon=9), 3)
+    ends = partial(Line, lambda x: 0.99 * x.sign().where(x.abs() >= 1.0, x / 0.99), initial=0.1)  # no first step comes so far
+    assert not blocks.same_resets(ends, partial(Line, initial=0.1))
 
 
 def test_the_line_is_what_it_says():

@@ -13,6 +13,9 @@ NESTED = f"{_FILES}::test_nesting_is_refused_before_anything_is_parsed"
 CLAIMS = f"{FORGED}::test_a_forgery_with_a_fitting_digest_is_refused"
 MORE_THAN_PROVED = f"{FORGED}::test_an_agent_that_tolerates_more_than_is_proved_says_so_or_is_refused"
 EARLY = f"{FORGED}::test_a_step_may_be_rounded_away_only_where_episodes_end_early"
+HOVERS = f"{FORGED}::test_a_barrier_that_hovers_hides_no_events"
+SPIKED = f"{LOOPS}::test_a_spike_in_u_makes_no_start_close"
+UNNAMED = f"{LOOPS}::test_seeds_that_only_the_certificate_names_measure_nothing"
 STEPS = f"{LOOPS}::test_events_are_those_of_every_single_step"
 
 #: (file, old text, new text, tests[, why it survives])
@@ -38,7 +41,7 @@ MUTANTS = [
     (STATISTICS, "reason = Reason.EPISODES_LEAVE if not total.entered else", "reason = Reason.EPISODES_LEAVE if total.entered else", TWINS),
     (STATISTICS, "events = min(total.events, n)", "events = min(total.left, n)", TWINS),
     (STATISTICS, "of {m}; at most\", min(total.mistaken, m)", "of {m}; at most\", 0", TWINS),
-    (STATISTICS, "clash = any(used_before(seed, record.used) for seed in record.seeds())", "clash = record.seed in record.used", TWINS),
+    (STATISTICS, "clash = any(used_before(seed, record.used or ()) for seed in record.seeds())", "clash = record.seed in (record.used or ())", TWINS),
     (STATISTICS, "fails = found > REPEATED * n", "fails = False", TWINS),
     (STATISTICS, "total.undefined, total.episodes,\n         Reason", "0, total.episodes,\n         Reason", TWINS),
     (STATISTICS, "total.outside, total.seen, Reason", "0, total.seen, Reason", TWINS),
@@ -50,7 +53,7 @@ MUTANTS = [
     (STATISTICS, "\"following\", psi + eta, ", "\"following\", psi, ", TWINS),
     # The record.
     (RECORD, "type(value) is not int or not low <= value", "not isinstance(value, int) or not low <= value", MALFORMED),
-    (RECORD, "not math.isfinite(value) or not low", "not low", MALFORMED),
+    (RECORD, "not abs(value) <= _FINITE or not low", "not low", MALFORMED),
     (RECORD, "set(body) != set(expected)", "not set(body) >= set(expected)", MALFORMED),
     (RECORD, "max(parts) <= self.events", "0 <= self.events", MALFORMED),
     (RECORD, "self.events <= min(sum(parts), self.episodes)", "self.events <= self.episodes", MALFORMED),
@@ -134,19 +137,26 @@ MUTANTS = [
     (CERTIFY, "return sorted({*recorded, *(int(s) for s in more)})", "return sorted(recorded)", f"{LOOPS}::test_seeds_of_the_training_are_found"),
     (CERTIFY, "return sorted({*recorded, *(int(s) for s in more)})", "return sorted(more)", f"{LOOPS}::test_seeds_of_the_training_are_found"),
     # Verifying.
+    (CERTIFY, "if said != labels:", "if False:", CLAIMS),
+    (STATISTICS, "if record.used is None or not (names_seeds or clash):", "if record.used is None:", UNNAMED),
+    (STATISTICS, "not (names_seeds or clash)", "not names_seeds", UNNAMED),
     (CERTIFY, "missing = set(named or ()) - set(record or ())", "missing: set[int] = set()", CLAIMS),
     (CERTIFY, "if missing or (named is not None and record is None):", "if missing and False:", CLAIMS),
     (CERTIFY, "    _refuse(found)\n    budget", "    budget", CLAIMS),
     (CERTIFY, "        found = compared(_proof(agent, claimed.level, budget))\n    _refuse(found)", "        return", CLAIMS),
     (CERTIFY, "compared(proved(given_up)) if given_up else", "{} if given_up else", f"{FORGED}::test_where_a_search_gave_up_the_rest_is_compared_all_the_same"),
-    (BLOCKS, "max(least[k], found[k] - 1) - fewer.get(k, 0)]", "found[k] - 10**6]", f"{FORGED}::test_one_lowered_count_is_found_where_its_block_is_measured"),
-    (BLOCKS, "max(least[k], found[k] - 1)", "least[k]", f"{FORGED}::test_a_barrier_that_hovers_hides_no_events"),
-    (BLOCKS, " - fewer.get(k, 0)]", "]", EARLY),
-    (BLOCKS, "max(found[\"steps\"] - claimed.steps, 0)", "abs(found[\"steps\"] - claimed.steps)", EARLY),
+    (BLOCKS, "if missing > min(found[k] - least[k], 1)]", "if False]", f"{FORGED}::test_one_lowered_count_is_found_where_its_block_is_measured"),
+    (BLOCKS, "min(found[k] - least[k], 1)", "found[k] - least[k]", HOVERS),
+    (BLOCKS, "for k, n in wrong.items() if n > 1)", "for k, n in wrong.items() if n > 10**6)", HOVERS),
+    (BLOCKS, "min(float(values.max()), max(1.0, abs(level)))", "float(values.max())", SPIKED),
+    (BLOCKS, "<= margin).sum()), _CLOSE)", "<= margin).sum()), 10**6)", f"{LOOPS}::test_where_many_starts_are_close_few_may_be_rounded_away"),
+    (BLOCKS, "short[\"uncovered\"] -= max(found.steps - claimed.steps, 0)", "pass", EARLY),
+    (BLOCKS, "max(found.steps - claimed.steps, 0)", "abs(found.steps - claimed.steps)", EARLY),
     (BLOCKS, ".sum()) / _LATE)", ".sum()) / 2)", EARLY),
     (BLOCKS, "block.steps[block.steps < longest]", "block.steps", EARLY),
     (BLOCKS, "if abs(getattr(claimed, k) - found[k]) > most]", "if abs(getattr(claimed, k) - found[k]) > 10**9]", CLAIMS),
-    (BLOCKS, "not math.isclose(number, other, rel_tol=1e-2, abs_tol=1e-6)", "False", CLAIMS),
+    (BLOCKS, "not _not_smaller(number, other)", "False", CLAIMS),
+    (BLOCKS, "-1e-6 * max(1.0, abs(found)) <= claimed", "-1e-2 * max(1.0, abs(found)) <= claimed", CLAIMS),
     (BLOCKS, "abs(a[1] - b[1]) > close * claimed.horizon + max(3, b[1] // 100)", "False", CLAIMS),
     (BLOCKS, "value > found.sizes[name] + slack", "False", CLAIMS),
     (CERTIFY, "code = Exit.TIME if set(found) == {Reason.UNDECIDED} else Exit.REFUSED", "code = Exit.REFUSED", f"{LOOPS}::test_a_slow_machine_that_verifies_says_that_the_time_was_short"),
@@ -157,4 +167,6 @@ MUTANTS = [
     ("torchrl_sspl/interrupts.py", "signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))", "pass", f"{FORGED}::test_a_proof_that_does_not_end_is_interrupted"),
     (CERTIFY, "if not plain or not all(type(v) in (int, float)", "if not plain or not all(True or type(v) in (int, float)", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),
     (BLOCKS, "all(a.shape == b.shape and torch.equal(a, b) for a, b in zip(seen(env), seen(twin), strict=True))", "True", f"{LOOPS}::test_a_system_is_compared_with_its_description"),
+    (BLOCKS, "range(min(horizon, _COMPARED))", "range(1)", f"{LOOPS}::test_resets_are_compared_with_their_description"),
+    (BLOCKS, "last = torch.tensor(min(horizon, ", "last = torch.tensor(max(horizon, ", f"{LOOPS}::test_resets_are_compared_with_their_description"),
 ]  # fmt: skip

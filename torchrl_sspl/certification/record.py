@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any
@@ -12,6 +13,7 @@ from torchrl_sspl.seeds import spawn
 
 _KINDS = ("states", "resets")
 _SYSTEMS = ("described", "given")
+_FINITE = sys.float_info.max  # an integer of a file may be larger
 _LARGEST = 10_000_000  # above which a number of episodes or steps is not believed
 #: Shares of the starts in the set and of the labels of U that may repeat others: float32 has few numbers on a line.
 REPEATED = 0.05
@@ -19,7 +21,7 @@ REPEATED = 0.05
 
 def finite(name: str, value: Any, low: float = -math.inf, high: float = math.inf) -> float:
     """A number of a file; ``CertificationError`` unless it is one, finite and in range."""
-    if type(value) not in (int, float) or not math.isfinite(value) or not low <= value <= high:
+    if type(value) not in (int, float) or not abs(value) <= _FINITE or not low <= value <= high:
         raise CertificationError(f"expected {name} to be a finite number in [{low}, {high}], received {str(value)[:40]!r}")
     return float(value)
 

@@ -111,7 +111,7 @@ def fingerprint(rows: Tensor, *, grid: float | None = None) -> list[str]:
     return [hashlib.blake2b(row.tobytes(), digest_size=16).hexdigest() for row in flat]
 
 
-def statistical_layer(record: Record) -> Layer:
+def statistical_layer(record: Record, *, names_seeds: bool = True) -> Layer:
     r"""What holds for fresh episodes, with which confidence; every word and number follows from the record.
 
     The unit is the episode: steps of one are not independent. An episode that leaves the set, enters U, shows an
@@ -122,6 +122,7 @@ def statistical_layer(record: Record) -> Layer:
 
     Args:
         record: how the episodes were drawn, and what was counted.
+        names_seeds: whether the agent itself names the seeds of its training; those that the record alone names cannot be checked.
 
     Source: Clopper and Pearson (1934); the paper has no statistical statement.
 
@@ -137,7 +138,7 @@ def statistical_layer(record: Record) -> Layer:
         text = "episodes from {B <= s} and observations of U were measured"
         layer.state(MEASURED, "sample", text, False, Reason.NOT_MEASURED, n=min(total.episodes, total.shown))
         return layer
-    _fresh(layer, record)
+    _fresh(layer, record, names_seeds)
     _within(layer, total)
     each = 1.0 - 0.5 * (1.0 - record.confidence)
     events = min(total.events, n)
@@ -172,13 +173,13 @@ def statistical_layer(record: Record) -> Layer:
     return layer
 
 
-def _fresh(layer: Layer, record: Record) -> None:
+def _fresh(layer: Layer, record: Record, names_seeds: bool) -> None:
     """Whether nothing was seen before."""
     total, sizes = record.total, record.sizes
-    if record.used is None:
+    clash = any(used_before(seed, record.used or ()) for seed in record.seeds())
+    if record.used is None or not (names_seeds or clash):
         layer.state(ASSUMED, "fresh", "the episodes are fresh: the agent does not say which seeds it was trained with")
     else:
-        clash = any(used_before(seed, record.used) for seed in record.seeds())
         text = "no seed of these episodes was used to train, choose or tune"
         layer.state(MEASURED, "fresh", text, not clash, Reason.CALIBRATION_REUSED, n=len(record.used))
     for name, what, known, found, n, reason in (

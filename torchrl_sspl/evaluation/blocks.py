@@ -28,7 +28,10 @@ from torchrl_sspl.sets import SAFE, UNSAFE
 
 _LATE = 200  # one step in so many may be another on another machine, where episodes end early
 _COVERED = 4000  # observations of which a covering radius is computed, from an environment's own resets
-_BARELY = 1e-4  # of the barrier's range: a decision closer than this may be rounded to the other side elsewhere
+_BARELY = 2.0**-18  # of what values near the level are: a decision closer than this may be rounded to the other side elsewhere
+_CLOSE = 2  # starts in a block that may be, at most
+_COMPARED = 20  # steps in which two environments are compared
+_EVENTS = ("left", "entered", "aliased", "undefined", "events", "exceeding", "uncovered", "mistaken", "outside")
 _GRID = 2.0**-19  # below which two trajectories are the same: networks round differently in different batches
 
 
@@ -86,15 +89,19 @@ def _random_actions(env: SafetyEnv, n: int, g: torch.Generator) -> Tensor:
     return env.action_low + torch.rand(n, env.action_dim, generator=g) * (env.action_high - env.action_low)
 
 
-def same_resets(make_env: MakeEnv, factory: MakeEnv) -> bool:
-    """Whether two makers give environments that begin and go on the same."""
+def same_resets(make_env: MakeEnv, factory: MakeEnv, horizon: int = _COMPARED) -> bool:
+    """Whether two makers give environments that begin, go on and end the same in so many steps, on a sample."""
 
     def seen(make: MakeEnv) -> list[Tensor]:
         env = make(batch_size=[2], seed=0)
         try:
-            data = env.reset()
-            after = env.step(data.set("action", env.action_spec.zero()))["next"]
-            return [data["pixels"], data["region"], after["pixels"], after["region"]]
+            data, chance, space = env.reset(), RandomController.within(env, 0), env.action_spec_unbatched.space
+            last = torch.tensor(min(horizon, getattr(env, "horizon", None) or horizon))
+            found = [last, space.low, space.high, data["pixels"], data["region"]]
+            for _ in range(min(horizon, _COMPARED)):
+                stepped, data = env.step_and_maybe_reset(data.set("action", chance.step(data["pixels"]).action.to(env.device)))
+                found += [stepped["next", k] for k in ("pixels", "region", "done")]
+            return found
         finally:
             env.close()
 
@@ -127,13 +134,13 @@ class Block:
 def counted(
     e: Episodes, level: float, tolerated: float | None, slack: float = 0.0, held: bool = False
 ) -> tuple[dict[str, int], Tensor]:
-    """Events by name, by more than a share of the barrier's range, and the largest error of each episode ``(n,)``; ``held``:
-    what would leave the set is cut to what it tolerates."""
+    """Events by name, by more than a share of what values near the level are, and the largest error of each episode ``(n,)``;
+    ``held``: what would leave the set is cut to what it tolerates."""
     alive, barrier, unsafe = e.alive, e.barrier.double(), (e.region == UNSAFE) & e.alive
     seen = e.seen.double()
     error = torch.where(alive[1:], e.prediction_error.double(), 0.0)
     worst = torch.where(error.isnan(), math.inf, error).amax(0)
-    margin = slack * _range(barrier[alive], level)
+    margin = slack * _scale(barrier[alive], level)
     events = {
         "left": ((barrier > level + margin) & alive).any(0),
         "entered": unsafe.any(0),
@@ -155,10 +162,10 @@ def holds_at(agent: Agent, level: float) -> bool:
     return agent.held_error > 0.0 and level == 0.0
 
 
-def _range(barrier: Tensor, level: float) -> float:
-    """Largest distance of finite barrier values from the level."""
+def _scale(barrier: Tensor, level: float) -> float:
+    """Size of barrier values near the level, which rounding is relative to: values far above it have no say."""
     values = (barrier[barrier.isfinite()] - level).abs()
-    return float(values.max()) if values.numel() else 0.0
+    return min(float(values.max()), max(1.0, abs(level))) if values.numel() else 0.0
 
 
 def _rims(e: Episodes, level: float) -> dict[str, tuple[int, float]]:
@@ -206,7 +213,7 @@ class StateBlocks:
             k = len(start)
             counts = least = replace(NOTHING, episodes=k, undefined=k, events=k, exceeding=k)
             worst, steps = torch.full((k,), math.inf), torch.zeros(k, dtype=torch.int64)
-        margin = _BARELY * _range(unsafe, self.level)
+        margin = _BARELY * _scale(unsafe, self.level)
         mistaken, surely = (int((~(unsafe > self.level - m)).sum()) for m in (0.0, margin))
         seen = {"shown": len(unsafe), "seen": len(latent), "outside": int(beyond.sum())}
         return Block(
@@ -291,7 +298,7 @@ class ResetBlocks:
         barrier, own_barrier = both.barrier, own.barrier
         looks = torch.minimum(barrier, both.seen)  # a picture alone may look safe where the memory knows better
         start = own.select(~(own_barrier[0] > level))  # a start that is no number counts, as an event
-        shown, margin = (both.region == UNSAFE) & both.alive, _BARELY * _range(barrier[both.alive], level)
+        shown, margin = (both.region == UNSAFE) & both.alive, _BARELY * _scale(barrier[both.alive], level)
         seen = both.latent[both.alive]
         counts, least = (
             replace(
@@ -302,12 +309,12 @@ class ResetBlocks:
             )
             for s, m in ((0.0, 0.0), (_BARELY, margin))
         )  # fmt: skip
-        near = ((own_barrier[0] - level).abs() <= margin).sum()
+        near = min(int(((own_barrier[0] - level).abs() <= margin).sum()), _CLOSE)
         worst = counted(start, level, self.tolerated)[1]
         mine, inside = own.latent[own.alive], own_barrier[own.alive] <= level
         safe = barrier[(both.region == SAFE) & both.alive]
         return Block(
-            counts, least, int(near), worst, start.alive.sum(0) - 1, _trajectories(start), [], _rims(start, level),
+            counts, least, near, worst, start.alive.sum(0) - 1, _trajectories(start), [], _rims(start, level),
             mine[inside], safe, looks[shown], mine, at_random.latent[at_random.alive],
         )  # fmt: skip
 
@@ -331,13 +338,23 @@ def _trajectories(e: Episodes) -> list[str]:
     return fingerprint(torch.cat([*picked, *ends], 1), grid=_GRID)
 
 
+def _trained_on(agent: Agent) -> set[str]:
+    """Fingerprints of the labelled states that the agent says it was trained with."""
+    named = agent.description.get("trained_on")
+    return {str(p) for p in named} if isinstance(named, list) else set()
+
+
+def compared_labels(agent: Agent, record: Record) -> int:
+    """With how many labelled states of the training those of the episodes are compared; from resets no states are told."""
+    return len(_trained_on(agent)) if record.kind == "states" else 0
+
+
 def summarise(record: Record, blocks: Sequence[Block], agent: Agent) -> None:
     """Fills in what needs all blocks: lengths, repetitions, errors, and the samples of the paper's conditions."""
     agent = on_host(agent)
     steps = torch.cat([b.steps for b in blocks])
     error, prints = torch.cat([b.error.double() for b in blocks]), [p for b in blocks for p in b.prints]
-    trained_on = agent.description.get("trained_on")
-    known = {str(p) for p in trained_on} if isinstance(trained_on, list) else set()
+    known = _trained_on(agent)
     g = torch.Generator().manual_seed(spawn(record.seed, "certificate", 2**24 - 1))
 
     def some(rows: Tensor) -> Tensor:  # the covering radius compares all pairs
@@ -366,9 +383,7 @@ def summarise(record: Record, blocks: Sequence[Block], agent: Agent) -> None:
     n = len(steps)
     lengths = {"shortest": int(steps.min()), "median": int(steps.median()), "longest": int(steps.max())} if n else {}
     leaked = sum(p in known for b in blocks for p in b.labelled)
-    # From resets no states are told: nothing can be compared.
-    seen = len(known) if record.kind == "states" else 0
-    sizes |= lengths | {"repeated": n - len(set(prints)), "trained_on": seen, "leaked": leaked}
+    sizes |= lengths | {"repeated": n - len(set(prints)), "trained_on": compared_labels(agent, record), "leaked": leaked}
     record.sizes |= sizes
     bound = largest_error_bound(error, record.confidence) if n else math.nan
     numbers |= {"episode_error": bound}
@@ -389,10 +404,27 @@ def block_changes(claimed: Counts, block: Block, resets: bool) -> str:
     moved = close * (longest + 1) + (2 * late if resets else 0)
     slack = {"episodes": close, "shown": close, "steps": close * longest + late, "seen": moved}
     wrong = [k for k, most in slack.items() if abs(getattr(claimed, k) - found[k]) > most]
-    events = ("left", "entered", "aliased", "undefined", "events", "exceeding", "uncovered", "mistaken", "outside")
-    fewer = {"uncovered": max(found["steps"] - claimed.steps, 0)}  # a step less is no step covered more
-    wrong += [k for k in events if getattr(claimed, k) < max(least[k], found[k] - 1) - fewer.get(k, 0)]
+    wrong += [k for k, missing in _fewer(claimed, block.counts).items() if missing > min(found[k] - least[k], 1)]
     return ", ".join(f"{k} claimed {getattr(claimed, k)}, measured {found[k]}" for k in wrong)
+
+
+def changes_together(claimed: Sequence[Counts], blocks: Mapping[int, Block]) -> str:
+    """Events that several blocks claim fewer of: of each kind, rounding takes one from a certificate, not from every block."""
+    missing = [_fewer(claimed[index], block.counts) for index, block in blocks.items()]
+    wrong = {k: sum(one[k] for one in missing) for k in _EVENTS}
+    return ", ".join(f"{k}: {n} fewer than measured" for k, n in wrong.items() if n > 1)
+
+
+def _fewer(claimed: Counts, found: Counts) -> dict[str, int]:
+    """Of each kind of event, how many fewer are claimed than measured."""
+    short = {k: getattr(found, k) - getattr(claimed, k) for k in _EVENTS}
+    short["uncovered"] -= max(found.steps - claimed.steps, 0)  # a step less is no step covered more
+    return {k: max(n, 0) for k, n in short.items()}
+
+
+def _not_smaller(claimed: float, found: float) -> bool:
+    """Whether a number is what was found, or a little larger, which is worse; what is smaller is rounding."""
+    return -1e-6 * max(1.0, abs(found)) <= claimed - found <= max(1e-6, 1e-2 * abs(found))
 
 
 def summary_changes(claimed: Record, found: Record, close: int) -> str:
@@ -405,13 +437,11 @@ def summary_changes(claimed: Record, found: Record, close: int) -> str:
             wrong.append(f"{name} claimed {value}, measured {found.sizes[name]}")
     for key, number in claimed.numbers.items():
         other = found.numbers[key]
-        if (number is None) != (other is None) or (
-            number is not None and other is not None and not math.isclose(number, other, rel_tol=1e-2, abs_tol=1e-6)
-        ):
+        if (number is None) != (other is None) or (number is not None and other is not None and not _not_smaller(number, other)):
             wrong.append(f"{key} claimed {number}, measured {other}")
     if [r[0] for r in claimed.rims] != [r[0] for r in found.rims] or any(
         abs(a[1] - b[1]) > close * claimed.horizon + max(3, b[1] // 100)
-        or not math.isclose(a[2], b[2], rel_tol=1e-2, abs_tol=1e-6)
+        or not _not_smaller(a[2], b[2])
         for a, b in zip(claimed.rims, found.rims, strict=True)
     ):
         wrong.append("errors by part of the set")

@@ -45,6 +45,8 @@ from torchrl_sspl.evaluation.blocks import (
     ResetBlocks,
     StateBlocks,
     block_changes,
+    changes_together,
+    compared_labels,
     described_system,
     holds_at,
     same_resets,
@@ -177,7 +179,7 @@ def certify_on_episodes(
         ['deterministic', 'paper', 'run-time', 'statistical']
     """
     factory = described_system(agent.description)
-    system = "described" if factory is not None and same_resets(make_env, factory) else "given"
+    system = "described" if factory is not None and same_resets(make_env, factory, horizon) else "given"
     root, used = _root_seed(agent) if seed is None else seed, _used(agent, used_seeds)
     record = Record("resets", system, root, episodes, horizon, envs, confidence, acceptable, used)
     certificate = _proved(agent, name, level, budget)
@@ -356,7 +358,7 @@ def _tolerated(certificate: Certificate, agent: Agent) -> float | None:
 
 def _measured_layers(record: Record, certificate: Certificate, agent: Agent) -> dict[str, Layer]:
     return {
-        "statistical": statistical_layer(record),
+        "statistical": statistical_layer(record, names_seeds=_used(agent, ()) is not None),
         "run-time": run_time_layer(record, _tolerated(certificate, agent), holds_at(agent, certificate.level), agent.tolerated_error > 0.0),
         "paper": paper_layer(record, agent.lipschitz_bound, chooses=isinstance(agent.policy, ChoosingPolicy)),
     }
@@ -482,9 +484,12 @@ def _refuse(found: Mapping[Reason, str]) -> None:
 
 
 def _history(claimed: Certificate, agent: Agent) -> dict[Reason, str]:
-    """Whether the record names every seed that the agent names."""
+    """Whether the record names every seed that the agent names, and as many labelled states."""
     if claimed.record is None:
         return {}
+    said, labels = claimed.record.sizes["trained_on"], compared_labels(agent, claimed.record)
+    if said != labels:
+        return {Reason.RECORD_CHANGED: f"trained_on claimed {said}, the agent names {labels} labelled states"}
     named, record = _used(agent, ()), claimed.record.used
     missing = set(named or ()) - set(record or ())
     if missing or (named is not None and record is None):
@@ -532,7 +537,7 @@ def _measured_again(
     try:
         for index in order:
             blocks[index] = source(index)
-            changes = block_changes(record.blocks[index], blocks[index], record.kind == "resets")
+            changes = block_changes(record.blocks[index], blocks[index], record.kind == "resets") or changes_together(record.blocks, blocks)
             if changes:
                 _refuse({Reason.RECORD_CHANGED: f"block {index}: {changes}"})
             if (time.monotonic() - began) * (1 + 1 / len(blocks)) > seconds:
