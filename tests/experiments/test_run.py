@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import json
+import sys
 from functools import partial
 from types import SimpleNamespace
 
@@ -241,6 +243,58 @@ def test_descriptions_tell_systems_apart(monkeypatch):
     assert [d.split(":")[0] for d in differences(one, describe(system(3.0, image_size=32)))] == ["unsafe"]
     monkeypatch.setitem(globals(), "LIMIT", 2.0)
     assert [d.split(":")[0] for d in differences(one, describe(system(2.0, image_size=32)))] == ["safe"]
+
+
+BORDERS, TABLE, ARRAY = [1.0], {"border": 1.0}, np.array([1.0])
+
+
+class Near:
+    def __init__(self, border):
+        self.border = border
+
+    def __call__(self, state, info):
+        return abs(state[0]) < self.border
+
+    def inside(self, state, info):
+        return abs(state[0]) < self.border
+
+
+def test_descriptions_follow_what_a_predicate_reads():
+    def found(border):
+        reads = lambda s, i: s[0] < BORDERS[0], lambda s, i: s[0] < TABLE["border"], lambda s, i: s[0] < ARRAY[0]
+        return [describe(x) for x in (*reads, Near(border), Near(border).inside, lambda s, i, n=Near(border): n(s, i))]
+
+    one = found(1.0)
+    assert one == found(1.0)
+    BORDERS[0] = TABLE["border"] = ARRAY[0] = 2.0
+    assert not set(one) & set(found(2.0))
+    assert describe(lambda x: x in {1, 2}) != describe(lambda x: x in {1, 3})
+    assert describe(GymnasiumPixels) == "torchrl_sspl.envs.gymnasium.GymnasiumPixels"
+    assert describe(type("A", (Near,), {"gain": 1.0})) != describe(type("A", (Near,), {"gain": 2.0}))
+
+
+def test_another_predicate_behind_the_same_path_or_another_encoder_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    sets = "from evaluation.systems import Lane as make\nBORDER = [{}]\ndef safe(o, i): return o[0] < 3\ndef unsafe(o, i): return o[0] >= BORDER[0]\n"
+    words = ["env=gymnasium", *(f"env.{k}=my_sets:{k}" for k in ("make", "safe", "unsafe")), "env.image_size=16", *SMALL]
+    words += ["synthesis.enabled=false", "trainer.total_frames=64", "out_dir=run"]
+
+    def experiment(border, encoder=None):
+        monkeypatch.delitem(sys.modules, "my_sets", raising=False)
+        (tmp_path / "my_sets.py").write_text(sets.format(border))
+        importlib.invalidate_caches()
+        return Experiment(compose(words), encoder=encoder)
+
+    experiment(5.0).train()
+    seen = lambda latent_dim: FrameEncoder(latent_dim, pool_to=8)  # noqa: E731
+    for changes, message in (((5.25,), "env.unsafe: my_sets.unsafe .*, now my_sets"), ((5.0, seen), "encoder: None, now .*lambda")):
+        other = experiment(*changes)
+        with pytest.raises(CheckpointError, match=message):
+            other.train()
+        other.trainer.collector.shutdown()
+    again = experiment(5.0)
+    again.train()
+    assert again.trainer.resumed
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ from torchrl_sspl.evaluation.known import evaluate
 from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
 from torchrl_sspl.evaluation.outcome import Outcome, write_metrics
 from torchrl_sspl.evaluation.physics import evaluate_physics
-from torchrl_sspl.experiments.description import describe, differences
+from torchrl_sspl.experiments.description import CODE_FILE, changed_code, code_of, describe, differences, keep_code
 from torchrl_sspl.experiments.own_systems import advice, check_encoder, check_factory
 from torchrl_sspl.files import RunDirectory, write
 from torchrl_sspl.interrupts import interruptible
@@ -330,6 +330,8 @@ class Experiment:
             (self.directory / "log.jsonl").unlink(missing_ok=True)
         write(self.directory / CONFIG_FILE, json.dumps(self.config.to_dict(), indent=1, sort_keys=True) + "\n")
         try:
+            if not (self.trainer.resumed and (self.directory / CODE_FILE).is_file()):
+                keep_code(self.directory, code_of(self.config, self._given_encoder))
             self.trainer.train()
         except EmptyRegionError as error:
             if self.phases.begun:
@@ -358,7 +360,7 @@ class Experiment:
                 part.pop(key, None)
             for key in ("progress", "checkpoint_seconds", "keep_checkpoints", "evaluate_every"):
                 part.get("trainer", {}).pop(key, None)
-        found = differences(then, now)
+        found = differences(then, now) + changed_code(self.directory, code_of(self.config, self._given_encoder))
         if found:
             raise CheckpointError(
                 f"expected the system, the networks and the settings of the run in '{self.directory}', received others ("
