@@ -412,7 +412,10 @@ def test_reading_a_configuration_loads_no_environment():
         ("synthesis.rollout_transitions=0", "rollout_transitions >= 1 with synthesis.rounds=2"), ("evaluation.horizon=0", "evaluation.horizon >= 1"),
         ("evaluation.certificate_seconds=-1", "evaluation.certificate_seconds >= 0"), ("seed=-1", "seed >= 0"), ("synthesis.batch=0", "synthesis.batch >= 4"),
         ("synthesis.dynamics_outlier=-0.1", "synthesis.dynamics_outlier >= 0"), ("synthesis.episode_steps=-3", "synthesis.episode_steps >= 1"),
-        ("synthesis.lowest_level=0.1", "between -0.2 and 0"),
+        ("synthesis.lowest_level=0.1", "between -0.2 and 0"), ("trainer.keep_checkpoints=0", "keep_checkpoints >= 1, received 0"),
+        ("network.policy_hidden=[8,-3]", r"policy_hidden >= 1, received \[8, -3\]"), ("network.dynamics_hidden=[0]", "dynamics_hidden >= 1"),
+        ("seed=18446744073709551616", "seed <= 18446744073709551615"), ("buffer.batch=0", "buffer.batch >= 1"), ("trainer.clip_norm=-1", "clip_norm > 0"),
+        ("trainer.optim_steps_per_batch=-3", "optim_steps_per_batch >= 1"),
     ],
 )  # fmt: skip
 def test_what_would_fail_after_the_joint_training_is_refused_before(word, message):

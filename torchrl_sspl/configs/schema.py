@@ -13,6 +13,7 @@ from torchrl_sspl.errors import ConfigError
 
 BACKENDS = ("sync", "process", "ray")
 RESIDUALS = 64  # observed errors nearby from which those of a latent are taken
+LARGEST_SEED = 2**64 - 1  # that torch takes
 LOWEST_LEVEL = -0.2  # to which held-out checks may shift the barrier
 MOST_NEAR_DRAWS = 10  # of rollouts in a round; the next seed is that of the rim of U
 PRESETS = ("sound", "paper", "quick", "smoke")
@@ -36,14 +37,16 @@ _LEAST = {
     "synthesis.unsafe_weight synthesis.exploration synthesis.residual_spread synthesis.teach_spread synthesis.recovery_coeff synthesis.change_coeff "
     "synthesis.choice_margin synthesis.lr optim.lr optim.weight_decay",
     1: "network.latent_dim evaluation.horizon evaluation.envs synthesis.episode_steps synthesis.transitions synthesis.residuals synthesis.actions "
-    "synthesis.rim_draws synthesis.near_draws synthesis.check_episodes synthesis.check_horizon",
+    "synthesis.rim_draws synthesis.near_draws synthesis.check_episodes synthesis.check_horizon network.dynamics_hidden network.policy_hidden buffer.batch "
+    "trainer.optim_steps_per_batch trainer.keep_checkpoints",
     4: "synthesis.turns synthesis.batch",
 }
-_ABOVE = {0: "network.lipschitz_bound synthesis.band evaluation.walk_seconds"}
+_ABOVE = {0: "network.lipschitz_bound synthesis.band evaluation.walk_seconds trainer.clip_norm"}
 _MOST = {
     1: "synthesis.leave_share synthesis.safe_share synthesis.cover_share synthesis.return_share",
     MOST_NEAR_DRAWS: "synthesis.near_draws",
     RESIDUALS: "synthesis.residuals",
+    LARGEST_SEED: "seed evaluation.seed evaluation.walk_seed",
 }
 
 
@@ -418,7 +421,7 @@ class Config:
                 for key in keys.split():
                     section, _, name = key.rpartition(".")
                     value = getattr(getattr(self, section) if section else self, name)
-                    if value is not None and not holds(value, bound):
+                    if not all(holds(v, bound) for v in (value if isinstance(value, list) else [value]) if v is not None):
                         raise ConfigError(f"expected {key} {sign} {bound}, received {value}")
         for key, grid in (("grid", self.evaluation.grid), ("kernel_grid", self.evaluation.kernel_grid)):
             if grid == 1:
