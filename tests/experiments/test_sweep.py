@@ -9,14 +9,18 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from torchrl_sspl.configs import compose
 from torchrl_sspl.envs.system import Requirement
-from torchrl_sspl.errors import CheckpointError, ConfigError
-from torchrl_sspl.experiments.sweep import expand, plan, sweep
+from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError
+from torchrl_sspl.evaluation.measurements import Evaluation
+from torchrl_sspl.evaluation.outcome import Outcome, write_metrics
+from torchrl_sspl.experiments.sweep import Task, _shown, expand, plan, sweep
 from torchrl_sspl.viz import compare as page
 
 # What a training leaves behind, in a tenth of a second; seed 13 fails.
@@ -159,6 +163,25 @@ def test_what_is_finished_is_not_run_again(command):
     out = sweep([*words, "evaluation.episodes=3"], command=command)  # not the same any more
     assert out.tasks[0].status == "done"
     assert calls(Path("many/seed=0")) == 2
+
+
+def test_agents_of_one_name_in_two_folders_are_two_settings(tmp_path):
+    config = compose(["env=pendulum", f"agent={tmp_path}/x/best", f"out_dir={tmp_path}/run"])
+    tasks = [Task(folder, replace(config, agent=f"{tmp_path}/{folder}/best"), []) for folder in ("x", "y")]
+    agent = SimpleNamespace(description={})
+    write_metrics(Outcome(tmp_path / "run", agent, config, None, {"own": Evaluation()}))
+    assert [task.finished for task in tasks] == [True, False]
+    text = (tmp_path / "run" / "metrics.json").read_text()
+    assert '"agent": "best-' in text
+    assert str(tmp_path) not in text
+    runs = [page.Run(t.name, tmp_path, {"config": _shown(t.config)}) for t in tasks]
+    assert page.differing(runs) == ["agent"]
+
+
+def test_a_directory_that_cannot_be_made_is_named(command):
+    Path("afile").write_text("")
+    with pytest.raises(OutputError, match="received 'afile/x': Not a directory; choose another out_dir"):
+        sweep(["env=pendulum", "seed=0,1", "out_dir=afile/x"], command=command)
 
 
 def test_one_job_at_a_time(command):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Mapping
@@ -174,12 +175,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _without_paths(value: Any) -> Any:
-    """Of absolute paths, wherever they stand alone, the last part."""
+def _without_paths(value: Any, told: bool = False) -> Any:
+    """Of absolute paths, wherever they stand alone, the last part; in a configuration, with what tells two of them apart."""
     if isinstance(value, Mapping):
-        return {k: _without_paths(v) for k, v in value.items()}
+        return {k: _without_paths(v, told or k == "config") for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_paths(v) for v in value]
+        return [_without_paths(v, told) for v in value]
     if isinstance(value, Path) or (isinstance(value, str) and Path(value).is_absolute()):
-        return Path(value).name
+        return Path(value).name + (f"-{hashlib.sha256(str(value).encode()).hexdigest()[:8]}" if told else "")
     return value

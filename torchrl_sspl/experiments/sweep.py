@@ -24,7 +24,8 @@ from typing import Any
 
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.configs.schema import Config
-from torchrl_sspl.errors import ConfigError, MissingDependencyError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError, OutputError
+from torchrl_sspl.evaluation.outcome import _without_paths
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.compare import Row, Run, compare, read_metrics, rows_of, text_table
 
@@ -56,8 +57,13 @@ class Task:
             before = json.loads((self.directory / "metrics.json").read_text())["config"]
         except (OSError, ValueError, KeyError, TypeError):
             return False
-        mine = json.loads(json.dumps(self.config.to_dict()))
+        mine = json.loads(json.dumps(_shown(self.config)))
         return all(before.get(k) == v for k, v in mine.items() if k != "out_dir")
+
+
+def _shown(config: Config) -> Any:
+    """A configuration as ``metrics.json`` has it."""
+    return _without_paths({"config": config.to_dict()})["config"]
 
 
 @dataclass
@@ -156,8 +162,8 @@ def sweep(
         command: what is called with the words of each run.
 
     Returns what was done; ``sweep.json`` and ``comparison.html`` are on disk. Raises ConfigError if a configuration is
-    not valid, before anything is started, and MissingDependencyError if Ray is asked for and not installed.
-    Source: none.
+    not valid, before anything is started, OutputError if a directory cannot be made, and MissingDependencyError if Ray is
+    asked for and not installed. Source: none.
     """
     if launcher not in LAUNCHERS:
         raise ConfigError(f"expected --launcher to be one of {', '.join(LAUNCHERS)}, received '{launcher}'")
@@ -168,18 +174,28 @@ def sweep(
     jobs = jobs or (cores if launcher == "local" else len(tasks))
     start = _ray_starter(tasks[0].config.collector.ray_address) if launcher == "ray" else _Local
     out = Sweep(directory, tasks)
-    directory.mkdir(parents=True, exist_ok=True)
+    for folder in (directory, *(task.directory for task in tasks)):
+        _make(folder)
     _write(out, overrides)
     with _signals() as received:
         out.signal = _work(tasks, lambda task: start([*command, *task.words], task.directory), jobs, received)
     done = [t.status.startswith("done") for t in tasks]
-    metrics = [read_metrics(t.directory) if ok else {"config": t.config.to_dict()} for t, ok in zip(tasks, done, strict=True)]
+    metrics = [read_metrics(t.directory) if ok else {"config": _shown(t.config)} for t, ok in zip(tasks, done, strict=True)]
     runs = [Run(t.name, t.directory, body) for t, body in zip(tasks, metrics, strict=True)]
     if any(run.finished for run in runs):
         out.rows = rows_of(runs)
         out.page = compare(runs, directory / "comparison.html", title=f"{directory.name}: {len(runs)} runs")
     _write(out, overrides)
     return out
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"expected a directory to write to, received '{directory}': {error.strerror or type(error).__name__}; choose another out_dir"
+        ) from error
 
 
 def _write(out: Sweep, overrides: Sequence[str]) -> None:
