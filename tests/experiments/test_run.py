@@ -225,6 +225,15 @@ def test_a_finished_experiment_is_not_trained_again_and_another_one_is_refused(t
     moved.trainer.collector.shutdown()
 
 
+def test_a_run_goes_on_with_a_logger_and_evaluations_that_it_began_without(tmp_path):
+    words = ["trainer.total_frames=64", "synthesis.enabled=false"]
+    build(tmp_path, *words).train()
+    again = build(tmp_path, *words, "logger=csv", "trainer.evaluate_every=1")
+    again._same_run()
+    assert again.trainer.resume()
+    again.trainer.collector.shutdown()
+
+
 LIMIT = 1.0
 
 
@@ -261,8 +270,9 @@ class Near:
 
 def test_descriptions_follow_what_a_predicate_reads():
     def found(border):
+        own = Near(border)
         reads = lambda s, i: s[0] < BORDERS[0], lambda s, i: s[0] < TABLE["border"], lambda s, i: s[0] < ARRAY[0]
-        return [describe(x) for x in (*reads, Near(border), Near(border).inside, lambda s, i, n=Near(border): n(s, i))]
+        return [describe(x) for x in (*reads, own, own.inside, lambda s, i: own(s, i))]
 
     one = found(1.0)
     assert one == found(1.0)

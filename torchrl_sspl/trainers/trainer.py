@@ -33,6 +33,7 @@ from torchrl_sspl.trainers.stepper import SSPLStepper
 
 Call = Callable[["SSPLTrainer"], Mapping[str, Any]]
 _PICTURES = ("replay_buffer", "trainer_module.replay_buffer")  # components that hold pictures
+_ADDED = ("logger", "trainer_module.evaluate")  # components that a run may get when it goes on
 
 
 class _RNGState(GlobalRNGState):
@@ -372,7 +373,7 @@ class SSPLTrainer(Trainer):
             checkpoint = self._sync_checkpoint_components()
             _check_sizes(latest)
             there = set(Checkpoint.manifest(latest)["components"])
-            names = [name for name in checkpoint.components if name in there or name not in _PICTURES]
+            names = [name for name in checkpoint.components if name in there or name not in (*_PICTURES, *_ADDED)]
             checkpoint.load(latest, components=names, map_location="cpu")
             self.collector.update_policy_weights_()
         except Exception as error:
