@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import subprocess
 import sys
 import time
@@ -178,6 +179,19 @@ def test_multirun_with_cfg_shows_the_commands(capsys):
     assert capsys.readouterr().out.splitlines() == [
         f"sspl train env=pendulum seed={k} out_dir=runs/pendulum/seed={k}" for k in (0, 1)
     ]
+
+
+def test_multirun_shows_commands_that_a_shell_takes(capsys):
+    assert cli.main(["train", "--multirun", "env=pendulum", "seed=0,1", "out_dir=my runs", "--cfg", "job"]) == 0
+    assert shlex.split(capsys.readouterr().out.splitlines()[1]) == ["sspl", "train", "env=pendulum", "seed=1", "out_dir=my runs/seed=1"]
+
+
+def test_options_may_stand_between_the_words_of_an_evaluation(monkeypatch, tmp_path):
+    seen = []
+    monkeypatch.setattr(cli, "evaluate_agent", lambda *a, **k: (seen.append(a), types.SimpleNamespace(measurements={}, to_dict=dict))[1])
+    assert cli.main(["evaluate", "pendulum", "--json", str(tmp_path / "f.json"), "episodes=5"]) == 0
+    assert seen == [("pendulum", ["episodes=5"])]
+    assert (tmp_path / "f.json").is_file()
 
 
 def stand_in(monkeypatch, name, **members):

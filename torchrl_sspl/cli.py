@@ -6,6 +6,7 @@ import argparse
 import json
 import math
 import os
+import shlex
 import sys
 from collections.abc import Sequence
 from contextlib import nullcontext
@@ -157,7 +158,7 @@ def _multirun(overrides: Sequence[str], options: dict[str, str]) -> int:
         raise ConfigError(f"expected --jobs to be an integer >= 1, received '{jobs}'")
     if "--cfg" in options:
         for task in sweep.plan(overrides)[1]:
-            print(f"sspl train {' '.join(task.words)}")
+            print(f"sspl train {shlex.join(task.words)}")
         return 0
     out = sweep.sweep(overrides, launcher=options.get("--launcher", "local"), jobs=None if jobs is None else int(jobs))
     print(out.summary())
@@ -171,7 +172,7 @@ def _evaluate(words: list[str]) -> int:
     parser.add_argument("overrides", nargs="*", metavar="key=value", help="fields of the evaluation, such as seed=7")
     parser.add_argument("--json", metavar="FILE", help="also write the measurements to this file")
     parser.add_argument("--device", default="cpu", help="device of the networks")
-    options = parser.parse_args(words)
+    options = parser.parse_intermixed_args(words)
     result = evaluate_agent(options.agent, options.overrides, device=options.device)
     for name, m in result.measurements.items():
         value = "not measured" if m.value is None else f"{m.value:.6g}"
@@ -251,7 +252,7 @@ def _compare(words: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="sspl compare", description="Runs side by side, on one page.")
     parser.add_argument("runs", nargs="+", metavar="RUN", help="directories of runs; other files are ignored")
     parser.add_argument("--out", metavar="FILE", help="the page; default: comparison.html beside the runs")
-    options = parser.parse_args(words)
+    options = parser.parse_intermixed_args(words)
     from torchrl_sspl.viz import compare as page
 
     runs = page.read_runs([run for run in options.runs if not Path(run).is_file()])

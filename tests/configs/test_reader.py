@@ -23,7 +23,7 @@ from torchrl_sspl.configs.reader import (
     valid_keys,
 )
 from torchrl_sspl.configs.schema import PRESETS
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError
 
 
 def value_at(config, key):
@@ -102,6 +102,9 @@ def test_a_system_of_your_own_is_a_file(tmp_path):
     config = compose([f"env={path}", "env.dt=.2"])
     assert config.env == {"_target_": "torchrl_sspl.envs.DubinsEnv", "speed": 0.5, "dt": 0.2}
     assert config.network.latent_dim == 5
+    path.write_text("preset: quick\nenv: {_target_: torchrl_sspl.envs.DubinsEnv}\n")
+    assert compose([f"env={path}"]) == compose([f"env={path}", "preset=quick"])
+    assert compose([f"env={path}", "preset=smoke"]).preset == "smoke"
     path.write_text("network: {latent_dims: 5}\n")
     with pytest.raises(ConfigError, match=r"received 'network\.latent_dims'; the nearest are network\.latent_dim,"):
         compose([f"env={path}"])
@@ -389,6 +392,24 @@ def test_gymnasium_by_import_paths(tmp_path, monkeypatch):
         gymnasium_env("CartPole-v1")
     with pytest.raises(ConfigError, match="my_cart:nobody"):
         gymnasium_env("my_cart:nobody", "my_cart:safe", "my_cart:unsafe")
+
+
+@pytest.mark.parametrize("name", ["CartPole-v99", "NoSuch-v1", "ALE/NoSuch-v5", "no_such_module:Env-v0"])
+def test_what_gymnasium_does_not_have_is_named(name):
+    with pytest.raises(ConfigError, match=f"env.make to be an id of gymnasium, .*'{name}'"):
+        gymnasium_env(name, "builtins:callable", "builtins:callable")
+
+
+def test_what_gymnasium_needs_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pygame", None)
+    env = gymnasium_env("CartPole-v1", "builtins:callable", "builtins:callable", image_size=16)
+    with pytest.raises(MissingDependencyError, match=r"pygame is not installed.*torchrl-sspl\[viz\]"):
+        env.reset()
+    monkeypatch.setitem(sys.modules, "Box2D", None)
+    monkeypatch.delitem(sys.modules, "gymnasium.envs.box2d.lunar_lander", raising=False)
+    monkeypatch.delitem(sys.modules, "gymnasium.envs.box2d", raising=False)
+    with pytest.raises(MissingDependencyError, match=r"env.make=LunarLander-v3, found less: .*gymnasium\[box2d\]"):
+        gymnasium_env("LunarLander-v3", "builtins:callable", "builtins:callable")
 
 
 def test_resolve_leaves_the_path_as_it_was():

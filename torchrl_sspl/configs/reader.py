@@ -24,7 +24,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from torchrl_sspl.configs.schema import _CHOICES, PRESETS, Config
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.files import write
 
 FOLDER = Path(__file__).parent
@@ -41,7 +41,7 @@ def compose(overrides: Sequence[str] = (), **defaults: Any) -> Config:
     """Configuration of a system and a preset with changes.
 
     The dataclasses' defaults <- ``env/<env>.yaml`` <- ``preset/<preset>.yaml`` <- ``env/<env>.<preset>.yaml`` where it
-    exists <- ``defaults`` <- ``overrides``.
+    exists <- ``defaults`` <- ``overrides``. A file of your own may name its preset (``preset: quick``).
 
     Args:
         overrides: strings such as ``"env=pendulum"``, ``"seed=3"`` or ``"network.policy_hidden=[32,32]"``; ``env=`` also
@@ -59,13 +59,12 @@ def compose(overrides: Sequence[str] = (), **defaults: Any) -> Config:
         (3, 1, 'runs/a', 64)
     """
     given = {**_flat(defaults), **parse(overrides)}
-    env, preset = given.pop("env", None), given.pop("preset", "sound")
+    env = given.pop("env", None)
+    own = {} if env is None else _file(_env_file(env))
+    preset = given.pop("preset", own.get("preset", "sound"))
     if preset not in PRESETS:
         raise ConfigError(f"expected preset to be one of {', '.join(PRESETS)}, received '{preset}'")
-    layers: list[Mapping[str, Any]] = []
-    if env is not None:
-        layers.append(_file(_env_file(env)))
-    layers.append(_file(FOLDER / "preset" / f"{preset}.yaml"))
+    layers: list[Mapping[str, Any]] = [own, _file(FOLDER / "preset" / f"{preset}.yaml")]
     if (both := FOLDER / "env" / f"{env}.{preset}.yaml").is_file():
         layers.append(_file(both))
     return _build([*layers, {"preset": preset}, given], free=len(layers))
@@ -473,7 +472,8 @@ def gymnasium_env(
         workers: processes that step and draw the environments.
         seed: of the resets.
 
-    Returns the environment. Raises ConfigError if a predicate is missing or a path cannot be imported. Source: none.
+    Returns the environment. Raises ConfigError if a predicate is missing, a path cannot be imported or gymnasium has no such id;
+    MissingDependencyError if it needs a package that is not installed. Source: none.
     """
     from torchrl_sspl.envs.gymnasium import GymnasiumPixels
 
@@ -505,7 +505,15 @@ class _Make:
             return make()
         import gymnasium
 
-        return gymnasium.make(self.path, render_mode="rgb_array")
+        try:
+            return gymnasium.make(self.path, render_mode="rgb_array")
+        except gymnasium.error.DependencyNotInstalled as error:
+            raise MissingDependencyError(f"expected what gymnasium needs for env.make={self.path}, found less: {error}") from error
+        except (gymnasium.error.Error, ModuleNotFoundError) as error:
+            raise ConfigError(
+                f"expected env.make to be an id of gymnasium, or package.module:function, received '{self.path}' "
+                f"({type(error).__name__}: {error})"
+            ) from error
 
 
 __all__ = [

@@ -22,7 +22,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from torchrl_sspl.errors import ConfigError, OverlapError, SSPLError, WorkerError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError, OverlapError, SSPLError, WorkerError
 from torchrl_sspl.sets import SAFE, UNLABELLED, UNSAFE
 
 Predicate = Callable[[Any, Mapping[str, Any]], Any]
@@ -91,7 +91,7 @@ class Game:
         return Moment(picture, self._region(observation, info), state, *rest)
 
     def _picture(self, observation: Any) -> Picture:
-        picture = np.asarray(observation if self._observes_pictures else self.env.render())
+        picture = np.asarray(observation if self._observes_pictures else self._drawn())
         if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
             raise ConfigError(
                 f"render: expected a uint8 picture (height, width, 3), received {picture.dtype} {picture.shape}."
@@ -99,6 +99,17 @@ class Game:
         if picture.shape[:2] == (self.image_size, self.image_size):
             return picture.copy()  # some renderers draw into the same memory again
         return area_averaged(picture, self.image_size)
+
+    def _drawn(self) -> Any:
+        from gymnasium.error import DependencyNotInstalled
+
+        try:
+            return self.env.render()
+        except DependencyNotInstalled as error:
+            raise MissingDependencyError(
+                f"expected what gymnasium draws with, found less: {error}; `pip install 'torchrl-sspl[viz]'` brings what its classic "
+                "control needs"
+            ) from error
 
     def _region(self, observation: Any, info: Mapping[str, Any]) -> int:
         safe, unsafe = (self._judged(name, predicate, observation, info) for name, predicate in self._predicates)
