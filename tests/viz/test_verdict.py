@@ -125,3 +125,14 @@ def test_nodes_of_a_grid_have_no_bound():
     assert bounded(most, "must", volume) == "must"
     lines = [_line(row) for row in [(most.label, volume, ">= 0.5", "", "must"), (none.label, nodes, "<= 0", "", "none seen")]]
     assert lines == ["Volume: 70 % of 10 (must be >= 0.5).", "Grid of U: none of 31,816 (must be <= 0)."]
+
+
+def test_a_set_of_another_level_is_named_and_is_not_the_one_of_the_agent():
+    certificate = shipped("pendulum")
+    certificate.level = -0.25
+    screen = first_screen(certificate, rows(0, 3000), trained=False)
+    assert screen.kind != "good"
+    assert screen.headline.startswith("Not certified as safe: ")
+    assert "never leaves {B <= -0.25}, a part of" in screen.headline
+    told = [screen.headline, *(text for _, text in (*screen.proved, *screen.measured))]
+    assert not any("B <= 0 " in text or "B <= 0}" in text for text in told if "In this run" not in text)

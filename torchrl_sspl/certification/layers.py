@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget
-from torchrl_sspl.certification.certificate import PROVED, Layer, Reason
+from torchrl_sspl.certification.certificate import EVERY_WAY, PROVED, Layer, Reason
 from torchrl_sspl.certification.conditions import (
     computed_error,
     decide_domain,
@@ -89,7 +89,6 @@ def deterministic_layer(
 
 
 _BOXES = 200_000  # after which a search that has to do without the Lipschitz constant gives up
-_EVERY_WAY = "by bounds on the barrier in every direction of the error"
 
 
 class _Proof:
@@ -172,7 +171,7 @@ class _Proof:
         found = largest_error(system, **how)
         delta, detail = found.delta, f"for errors above {up(found.refuted_above)} the argument fails"
         if self._in_every_way(system, delta):
-            delta, detail = self.required, _EVERY_WAY
+            delta, detail = self.required, EVERY_WAY
         text = "the same, whatever error of at most this is added to d(z, pi(z))"
         if not self._error("tolerated error", text, delta, Reason.MARGIN_TOO_SMALL, detail):
             return

@@ -43,6 +43,16 @@ def shown(statement: Any, digits: int = 4) -> str:
     return _with_unit(statement.value, statement.unit, digits, statement.name in LOWER_BOUNDS)
 
 
+def printable(text: str) -> str:
+    r"""A line without what could steer a terminal or look like another line. Source: none.
+
+    Example:
+        >>> printable("a\nb")
+        'a\\nb'
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+
+
 def missed(statement: Any, digits: int = 3) -> str:
     """By how much a statement fails, at most, "" where unknown; what a search found may be exceeded elsewhere.
 

@@ -119,5 +119,5 @@ def logged(evaluation: Evaluation) -> dict[str, Any]:
     """The figures of an evaluation that are logged, under their documented names."""
     names = (*_CALLED, "starts_inside", "touch_unsafe", "leave", "random_touch_unsafe")
     # A fixed set of names: what was not seen is not a number.
-    values = {f"eval_{n}": evaluation[n] for n in names}
+    values = {f"eval_{n}": evaluation[n] if n in evaluation.measurements else None for n in names}
     return {name: float("nan") if value is None else value for name, value in values.items()}

@@ -83,17 +83,17 @@ def first_screen(
         return FirstScreen(head, kind, _joined(_of_run(rows, kinds)), [("good", line) for line in proved], found)
     proof = certificate.layers["deterministic"]
     counted = _counted(certificate)
-    parts = [_proof(proof), counted]
+    parts = [_proof(proof, certificate.level), counted]
     run_time = certificate.layers.get("run-time")
     if run_time is not None and proof.holds:
         parts.append(_covered(run_time))
     of_parts, of_rows = [kind for kind, _ in parts], [k for k, row in zip(kinds, rows, strict=True) if row[4] not in SEEN]
     worst = _worst(of_parts + of_rows)
-    said = _word(proof, of_parts, of_rows) + ": " + "; ".join(text for _, text in parts) + "."
+    said = _word(proof, of_parts, of_rows) + ": " + "; ".join(_at(certificate.level, text) for _, text in parts) + "."
     paper = certificate.layers.get("paper")
     more = [] if paper is None or paper.holds else ["Not certified: the paper's own conditions with its margins"]
     more += _of_run(rows, kinds) + ([] if trained else ["The certificate came with the agent; this run neither trained nor proved anything"])
-    return FirstScreen(said, worst, _joined(more), _proofs(proof), [*_evidence(certificate), *found])
+    return FirstScreen(said, worst, _joined(more), [(kind, _at(certificate.level, text)) for kind, text in _proofs(proof)], [*_evidence(certificate), *found])
 
 
 def _joined(sentences: Sequence[str]) -> str:
@@ -115,7 +115,14 @@ def _word(proof: Layer, parts: Sequence[str], rows: Sequence[str]) -> str:
     return "Certified, but this run has too few episodes to confirm it" if "fair" in rows else "Safe as far as this reaches"
 
 
-def _proof(layer: Layer) -> Item:
+def _at(level: float, text: str) -> str:
+    """A sentence about {B <= 0}, of another level."""
+    return text if level == 0.0 else text.replace("B <= 0", f"B <= {level:g}").replace("B > 0", f"B > {level:g}")
+
+
+def _proof(layer: Layer, level: float) -> Item:
+    if layer.holds and level != 0.0:
+        return "fair", "in the learned dynamics the policy provably never leaves {B <= 0}, a part of the set that the agent calls safe"
     if layer.holds:
         return "good", "in the learned dynamics the policy provably never leaves the safe set {B <= 0}"
     reason = next(iter(layer.reasons), None)
@@ -207,7 +214,7 @@ def _evidence(certificate: Certificate) -> list[Item]:
         s = _statement(layer, name)
         if s is not None and n and s.value is not None:
             limit = f"at most {up(100 * s.value, 3)} %, must be at most {100 * certificate.record.acceptable:g} %"
-            items.append(("good" if s.holds else "bad", f"{text}; {limit} (both with {100 * sure:g} % confidence)."))
+            items.append(("good" if s.holds else "bad", f"{_at(certificate.level, text)}; {limit} (both with {100 * sure:g} % confidence)."))
     run_time = certificate.layers.get("run-time")
     if run_time is not None and certificate.layers["deterministic"].holds:
         kind, text = _covered(run_time)
