@@ -43,6 +43,23 @@ def shown(statement: Any, digits: int = 4) -> str:
     return _with_unit(statement.value, statement.unit, digits, statement.name in LOWER_BOUNDS)
 
 
+def line_of(statement: Any, checked: bool) -> str:
+    """One statement for people, its numbers rounded to the side on which they are still true; ``checked`` now, or claimed. Source: none.
+
+    Example:
+        >>> from torchrl_sspl.certification.certificate import Statement
+        >>> line_of(Statement("covered", "of them; at most", "measured", True, 0.0012, "share", n=3000, confidence=0.95), True)
+        '    measured  of them; at most 0.12 % (n = 3,000, 95 %)'
+    """
+    s = statement
+    size = "" if s.n is None else f"n = {s.n:,}"
+    sample = ", ".join(x for x in (size, "" if s.confidence is None else f"{100 * s.confidence:g} %") if x)
+    missing = f", misses by {missed(s)}" if missed(s) else ""
+    status = "FAILS" if s.holds is False else s.kind if checked or s.kind == "assumed" else "claimed"
+    text = f"{s.text} {shown(s)}".rstrip() + (f" ({sample})" if sample else "")
+    return f"    {status:9s} {text}{missing}" + (f" [{s.detail}]" if s.detail else "")
+
+
 def printable(text: str) -> str:
     r"""A line without what could steer a terminal or look like another line. Source: none.
 

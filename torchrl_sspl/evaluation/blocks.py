@@ -28,7 +28,7 @@ from torchrl_sspl.sets import SAFE, UNSAFE
 
 _LATE = 200  # one step in so many may be another on another machine, where episodes end early
 _COVERED = 4000  # observations of which a covering radius is computed, from an environment's own resets
-_BARELY = 2.0**-18  # of what values near the level are: a decision closer than this may be rounded to the other side elsewhere
+_BARELY = 2.0**-14  # of what values near the level are: a decision closer than this may be rounded to the other side elsewhere
 _CLOSE = 2  # starts in a block that may be, at most
 _COMPARED = 20  # steps in which two environments are compared
 _EVENTS = ("left", "entered", "aliased", "undefined", "events", "exceeding", "uncovered", "mistaken", "outside")

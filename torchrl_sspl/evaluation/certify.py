@@ -19,12 +19,10 @@ from tqdm import tqdm
 
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import (
-    ASSUMED,
     TOLERATED,
     Certificate,
     Layer,
     Reason,
-    Statement,
     configuration_digest,
     differences,
     effort,
@@ -35,7 +33,7 @@ from torchrl_sspl.certification.floating import UNITS
 from torchrl_sspl.certification.layers import deterministic_layer, level_that_holds
 from torchrl_sspl.certification.loop import closed_loop
 from torchrl_sspl.certification.record import Counts, Record
-from torchrl_sspl.certification.rounding import LOWER_BOUNDS, missed, printable, shown
+from torchrl_sspl.certification.rounding import LOWER_BOUNDS, line_of, printable
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CertificationError, CheckpointError, ConfigError, SSPLError
@@ -573,7 +571,7 @@ def _print(claimed: Certificate, agent: Agent, unmeasured: str, blocks: int, rep
             checked = f"checked again on {unmeasured}"
         report(f"{layer.name:14s} {checked}: {layer.verdict}")
         for s in layer.statements:
-            report(_line(s, proof or not unmeasured))
+            report(line_of(s, proof or not unmeasured))
     if claimed.record is not None:
         limits = 100 * claimed.record.acceptable, 100 * claimed.record.confidence
         report(f"A bound on a risk holds here if it is at most {limits[0]:g} %: the two of the statistical layer together, and that of the run-time layer by itself, with {limits[1]:g} % confidence")
@@ -583,16 +581,6 @@ def _print(claimed: Certificate, agent: Agent, unmeasured: str, blocks: int, rep
     open_layers = [layer.name for layer in claimed.layers.values() if not layer.holds]
     if open_layers:
         report(f"What it says is that these layers are not certified: {', '.join(open_layers)}")
-
-
-def _line(s: Statement, checked: bool) -> str:
-    """One statement for people, its numbers rounded to the side on which they are still true."""
-    size = "" if s.n is None else f"n = {s.n:,}"
-    sample = ", ".join(x for x in (size, "" if s.confidence is None else f"{100 * s.confidence:g} %") if x)
-    missing = f", misses by {missed(s)}" if missed(s) else ""
-    status = "FAILS" if s.holds is False else s.kind if checked or s.kind == ASSUMED else "claimed"
-    text = f"{s.text} {shown(s)}".rstrip() + (f" ({sample})" if sample else "")
-    return f"    {status:9s} {text}{missing}" + (f" [{s.detail}]" if s.detail else "")
 
 
 if __name__ == "__main__":

@@ -117,9 +117,10 @@ class Agent(nn.Module):
         if not 0.0 < self.lipschitz_bound < math.inf:
             raise ConfigError(f"expected a Lipschitz bound that is finite and above zero, received {lipschitz_bound}")
         self.description: dict[str, Any] = dict(description or {})
-        matrix, dtype = gain_matrix(gain, self.latent_dim), self.barrier[0].weight.dtype
-        given = isinstance(gain, Tensor) and gain.ndim == 2  # a matrix is not rounded to float32 in between
-        self.register_buffer("gain", gain.detach().cpu().to(dtype, copy=True) if given else matrix.to(dtype))
+        matrix = gain_matrix(gain, self.latent_dim)
+        if isinstance(gain, Tensor) and gain.ndim == 2:  # a matrix is not rounded to float32 in between
+            matrix = gain.detach().cpu().clone()
+        self.register_buffer("gain", matrix.to(next(self.barrier.parameters()).dtype))
         error = self.description.get("tolerated_error", 0.0)
         if type(error) not in (int, float) or not 0.0 <= error < math.inf:
             raise ConfigError(f"expected a tolerated error that is finite and not negative, received {str(error)[:40]!r}")
