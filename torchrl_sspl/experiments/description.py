@@ -171,8 +171,8 @@ def code_of(config: Config, encoder: Any = None) -> dict[str, Any]:
     Of what is in this library nothing is said. Source: none.
 
     Example:
-        >>> code_of(Config(env={"_target_": "torchrl_sspl.envs.PendulumEnv"}), lambda latent_dim: None)
-        {'encoder': 'torchrl_sspl.experiments.description.<lambda> ...'}
+        >>> sorted(code_of(Config(env={"_target_": "torchrl_sspl.envs.PendulumEnv"}), lambda latent_dim: None))
+        ['encoder']
     """
     env = config.env if isinstance(config.env, dict) else {}
     named = {**{f"env.{key}": value for key, value in env.items()}, "encoder": config.network.encoder}
