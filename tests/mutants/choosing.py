@@ -40,7 +40,7 @@ MUTANTS = [
     (LOOP, "accepted = -float(cast(Tensor, policy.margin))", "accepted = float(cast(Tensor, policy.margin))", LARGEST),
     (LOOP, "if any(weight) or len(weight) > 1:", "if False:", WEIGHED),
     (LOOP, "action if scale is None else action / scale", "action", GRAPH),
-    (LOOP, "looped.side_by_side([looped.network(k, barrier) for k in inner])", "looped.side_by_side([looped.network(k, barrier) for k in inner[::-1]])", GRAPH),
+    (LOOP, "looped.side_by_side([looped.network(k, barrier) for k in reads])", "looped.side_by_side([looped.network(k, barrier) for k in inner[::-1]])", GRAPH),
     (CONDITIONS, "constant = -level if every_way else system.lost_by(error) - level", "constant = -level", COUNTS),
     (FLOATING, "nan_to_num(nan=torch.inf).amax(1)", "nan_to_num(nan=torch.inf).amin(1)", f"{WORST} {ROUNDED}"),
     # What is refused.
