@@ -134,7 +134,7 @@ def write_metrics(outcome: Outcome) -> Path:
 
     Measurements (by evaluation, then by name), requirements and verdicts, checks, budget, warnings and configuration.
     No path of this machine is written: of the configuration, ``out_dir`` is left out, and of paths only the last part
-    stays.
+    stays, in the configuration with a hash that tells two of them apart.
     """
     from torchrl_sspl import __version__
 
