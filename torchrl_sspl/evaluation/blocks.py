@@ -24,7 +24,7 @@ from torchrl_sspl.functional import covering_radius
 from torchrl_sspl.modules.agent import Agent, on_host
 from torchrl_sspl.modules.controller import premise_met
 from torchrl_sspl.seeds import spawn
-from torchrl_sspl.sets import SAFE, UNSAFE
+from torchrl_sspl.sets import SAFE, UNSAFE, Union
 
 _LATE = 200  # one step in so many may be another on another machine, where episodes end early
 _COVERED = 4000  # observations of which a covering radius is computed, from an environment's own resets
@@ -255,7 +255,8 @@ class StateBlocks:
 
     def _anywhere(self, n: int, g: torch.Generator) -> Tensor:
         """States of the state space, of which a part is a sample, too: those of a union are not grouped."""
-        return self.env.state_space.shuffled(n, generator=g, device=g.device).to(self.env.device)
+        state = self.env.sample_states(n, g, region=self.env.state_space)
+        return state[torch.randperm(n, generator=g)] if isinstance(self.env.state_space, Union) else state
 
     def _entering(self, n: int, g: torch.Generator) -> tuple[Tensor, Tensor]:
         """States of U that one step under a uniform random action leads into, and the states before it."""
