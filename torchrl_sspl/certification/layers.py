@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.branch_and_bound import SLACK, Budget
-from torchrl_sspl.certification.certificate import EVERY_WAY, PROVED, Layer, Reason
+from torchrl_sspl.certification.certificate import BY_LIPSCHITZ, EVERY_WAY, PROVED, Layer, Reason
 from torchrl_sspl.certification.conditions import (
     computed_error,
     decide_domain,
@@ -169,7 +169,7 @@ class _Proof:
         """Which error the set tolerates, in real arithmetic and in that of the computed numbers."""
         how: dict[str, Any] = {"level": self.level, "tolerance": self.tolerance, "budget": self.budget}
         found = largest_error(system, **how)
-        delta, detail = found.delta, f"for errors above {up(found.refuted_above)} the argument fails"
+        delta, detail = found.delta, BY_LIPSCHITZ.format(up(found.refuted_above))
         if self._in_every_way(system, delta):
             delta, detail = self.required, EVERY_WAY
         text = "the same, whatever error of at most this is added to d(z, pi(z))"

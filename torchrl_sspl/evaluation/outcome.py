@@ -157,7 +157,7 @@ def write_metrics(outcome: Outcome) -> Path:
         "warnings": outcome.warnings,
         "config": config,
     }
-    text = json.dumps(_without_paths(_finite(body)), indent=1, sort_keys=True, allow_nan=False) + "\n"
+    text = json.dumps(without_paths(_finite(body)), indent=1, sort_keys=True, allow_nan=False) + "\n"
     path = Path(outcome.directory) / METRICS_FILE
     write(path, text)
     beside = path.parent / "agent"
@@ -175,12 +175,12 @@ def _finite(value: Any) -> Any:
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _without_paths(value: Any, told: bool = False) -> Any:
+def without_paths(value: Any, told: bool = False) -> Any:
     """Of absolute paths, wherever they stand alone, the last part; in a configuration, with what tells two of them apart."""
     if isinstance(value, Mapping):
-        return {k: _without_paths(v, told or k == "config") for k, v in value.items()}
+        return {k: without_paths(v, told or k == "config") for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_without_paths(v, told) for v in value]
+        return [without_paths(v, told) for v in value]
     if isinstance(value, Path) or (isinstance(value, str) and Path(value).is_absolute()):
         return Path(value).name + (f"-{hashlib.sha256(str(value).encode()).hexdigest()[:8]}" if told else "")
     return value

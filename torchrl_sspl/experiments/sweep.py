@@ -25,7 +25,7 @@ from typing import Any
 from torchrl_sspl.configs.reader import EnvFactory, compose, parse
 from torchrl_sspl.configs.schema import Config
 from torchrl_sspl.errors import ConfigError, MissingDependencyError, OutputError
-from torchrl_sspl.evaluation.outcome import _without_paths
+from torchrl_sspl.evaluation.outcome import without_paths
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.compare import Row, Run, compare, read_metrics, rows_of, text_table
 
@@ -63,7 +63,7 @@ class Task:
 
 def _shown(config: Config) -> Any:
     """A configuration as ``metrics.json`` has it."""
-    return _without_paths({"config": config.to_dict()})["config"]
+    return without_paths({"config": config.to_dict()})["config"]
 
 
 @dataclass
