@@ -120,7 +120,8 @@ class Agent(nn.Module):
         matrix = gain_matrix(gain, self.latent_dim)
         if isinstance(gain, Tensor) and gain.ndim == 2:  # a matrix is not rounded to float32 in between
             matrix = gain.detach().cpu().clone()
-        self.register_buffer("gain", matrix.to(next(self.barrier.parameters()).dtype))
+        first: Any = self.barrier[0]
+        self.register_buffer("gain", matrix.to(first.weight.dtype))
         error = self.description.get("tolerated_error", 0.0)
         if type(error) not in (int, float) or not 0.0 <= error < math.inf:
             raise ConfigError(f"expected a tolerated error that is finite and not negative, received {str(error)[:40]!r}")
