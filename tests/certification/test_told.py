@@ -69,8 +69,22 @@ def test_a_tolerated_error_is_found_in_one_of_two_ways_and_says_nothing_else(iss
     claimed, again = (Certificate.load(issued / "certificate.json") for _ in range(2))
     again.layers["deterministic"]["tolerated error"].detail = EVERY_WAY
     claimed.layers["deterministic"]["tolerated error"].detail = detail
-    claimed.written = None
-    assert set(differences(claimed, again)) == reasons
+    claimed.written, required = None, claimed.layers["deterministic"]["tolerated error"].value
+    assert set(differences(claimed, again, required=required)) == reasons
+
+
+def test_where_there_is_no_time_to_look_in_every_direction_nobody_is_called_a_liar(tmp_path, monkeypatch):
+    agent = line_agent(tolerated_error=0.1995)  # B = max(z1 + 2, 0) - 2.5, of which the constant 1.5 leaves too little
+    first, last = agent.barrier[0], agent.barrier[-1]
+    for parameter, values in ((first.weight, [[1.0, 0.0]] + 3 * [[0.0, 0.0]]), (first.bias, [2.0, 0.0, 0.0, 0.0]), (last.weight, [[1.0, 0.0, 0.0, 0.0]]), (last.bias, [-2.5])):
+        parameter.data.copy_(torch.tensor(values))
+    agent.save(tmp_path)
+    certificate = certify(agent, None, name="line")
+    assert certificate.layers["deterministic"]["tolerated error"].detail == EVERY_WAY
+    certificate.save(tmp_path / "certificate.json")
+    monkeypatch.setattr("torchrl_sspl.certification.layers._Proof._in_every_way", lambda *_, **__: False)
+    code, text = verify(tmp_path, env=None)
+    assert (code, "FAILED UNDECIDED" in text) == (Exit.TIME, True), text
 
 
 def test_level_and_system_are_told_and_nothing_steers_the_terminal(tmp_path):

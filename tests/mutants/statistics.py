@@ -4,6 +4,7 @@ from __future__ import annotations
 
 RECORD, STATISTICS = "torchrl_sspl/certification/record.py", "torchrl_sspl/certification/statistics.py"
 CERTIFICATE, CERTIFY = "torchrl_sspl/certification/certificate.py", "torchrl_sspl/evaluation/certify.py"
+ROUNDING = "torchrl_sspl/certification/rounding.py"
 SEEDS, BLOCKS = "torchrl_sspl/seeds.py", "torchrl_sspl/evaluation/blocks.py"
 BOUNDS, TWINS = "tests/certification/test_statistics.py", "tests/certification/test_refusals.py"
 FORGED, LOOPS = "tests/certification/test_forgeries.py", "tests/evaluation/test_certify.py"
@@ -162,7 +163,7 @@ MUTANTS = [
     (CERTIFY, "code = Exit.TIME if set(found) == {Reason.UNDECIDED} else Exit.REFUSED", "code = Exit.REFUSED", f"{LOOPS}::test_a_slow_machine_that_verifies_says_that_the_time_was_short"),
     (BLOCKS, "kind = resolve(spec[\"_target_\"]) if found else None", "kind = resolve(spec[\"_target_\"])", f"{LOOPS}::test_code_that_a_description_names_is_imported_only_if_it_is_trusted"),
     (BLOCKS, "if not (isinstance(kind, type) and issubclass(kind, SafetyEnv)):", "if False:", f"{LOOPS}::test_the_system_of_a_description_is_one_of_the_library"),
-    (CERTIFY, "s.kind if checked or s.kind == ASSUMED else \"claimed\"", "s.kind", f"{FORGED}::test_without_the_system_nothing_measured_is_printed_as_checked"),
+    (ROUNDING, "s.kind if checked or s.kind == \"assumed\" else \"claimed\"", "s.kind", f"{FORGED}::test_without_the_system_nothing_measured_is_printed_as_checked"),
     (CERTIFY, "except CheckpointError as error:\n        raise _Stop(Exit.AGENT", "except CheckpointError as error:\n        raise _Stop(Exit.REFUSED", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),
     ("torchrl_sspl/interrupts.py", "signal.setitimer(signal.ITIMER_REAL, max(seconds, 1e-3))", "pass", f"{FORGED}::test_a_proof_that_does_not_end_is_interrupted"),
     (CERTIFY, "if not plain or not all(type(v) in (int, float)", "if not plain or not all(True or type(v) in (int, float)", f"{FORGED}::test_an_agent_that_cannot_be_read_has_an_exit_code_of_its_own"),

@@ -504,7 +504,7 @@ def _tolerated_changes(
         short = Reason.MARGIN_TOO_SMALL if a.name == TOLERATED else Reason.ROUNDING
         weaker = less and missed and not a.holds and a.reason == short.name
         return [] if weaker else [(Reason.NUMBERS_CHANGED, numbers)]
-    if not a.holds or a.misses_by is not None:
+    if not a.holds or a.misses_by is not None or (a.detail == EVERY_WAY and a.value != required):  # in every direction no more is asked for
         return [(Reason.NUMBERS_CHANGED, numbers)]
     said, found = ([float(m.group()) for m in _NUMBER.finditer(s.detail)] for s in (a, b))
     if a.name == TOLERATED and any(limit < a.value for limit in said):
