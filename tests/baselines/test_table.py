@@ -88,6 +88,17 @@ def test_a_failure_is_filmed_from_a_start_that_is_claimed_until_it_is_in_u(tmp_p
     assert page(rows, tmp_path / "table.html").read_text().count("data:video/mp4") == 1
     assert (tmp_path / "failures-pendulum.mp4").stat().st_size > 10_000
     assert failures([safe], tmp_path / "none.mp4") is None
+    seeds = [replace(fails, out_dir=str(safe.directory)), replace(fails, seed=1)]  # of one method, of which the second failed
+    assert [ax.get_title() for ax in claims(seeds).axes if ax.images] == ["depth beta=0.5\nnone, seed 0"]
+    assert failures(seeds, tmp_path / "second.mp4").is_file()
+
+
+def test_a_table_lies_in_the_directory_that_it_is_given(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["table", "methods=lqr", "env=pendulum", "out_dir=other", *SMALL]) == 0
+    assert {path.name for path in (tmp_path / "other").iterdir()} == {"pendulum", "rows.csv", "rows.json", "table.html", "table.md"}
+    assert (tmp_path / "other/pendulum/none/lqr/0" / ROW_FILE).is_file()
+    assert not (tmp_path / "runs").exists()
 
 
 @pytest.mark.slow

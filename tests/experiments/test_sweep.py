@@ -216,7 +216,7 @@ def test_a_signal_stops_the_runs_and_the_same_command_goes_on(command, number, l
     assert process.returncode == 128 + number
     assert "the same command goes on where it was" in shown
     assert Path("many/seed=99/state").read_text() == "saved"
-    assert not Path("many/seed=0").exists()
+    assert not Path("many/seed=0/calls.txt").exists()
     assert [r["status"] for r in json.loads(Path("many/sweep.json").read_text())["runs"]] == ["interrupted", "waiting", "waiting"]
     out = sweep(words, command=command)
     assert [t.status for t in out.tasks] == ["done"] * 3

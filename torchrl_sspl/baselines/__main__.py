@@ -15,9 +15,9 @@ _USAGE = """python -m torchrl_sspl.baselines METHOD [env=pendulum|dubins] [budge
 Fits a method, measures it and prints the row; score.episodes=... and the like are sizes of the measurement. What has been
 measured is read again, not measured again.
 
-python -m torchrl_sspl.baselines table [methods=NAME,NAME:key=value] [env=pendulum,dubins] [budget=small] [seed=0,1,2] [trials=8] [run=false] [jobs=2]
+python -m torchrl_sspl.baselines table [methods=NAME,NAME:key=value] [env=pendulum,dubins] [budget=small] [seed=0,1,2] [trials=8] [out_dir=runs/baselines] [run=false] [jobs=2]
 
-Runs the cells that are missing, as many at a time as jobs, and writes runs/baselines/table.md and table.html. METHOD is one of:
+Runs the cells that are missing, as many at a time as jobs, and writes table.md and table.html into out_dir. METHOD is one of:
 """
 
 

@@ -50,8 +50,9 @@ class Cell:
         seed: of data, weights and batches.
         options: ``key=value`` changes of the method's configuration.
         score: sizes of the measurements.
-        out_dir: where the row is written.
+        out_dir: where the row is written; "": below ``root``.
         trials: of the tuning, by which options are chosen first, see :mod:`~torchrl_sspl.baselines.tuning`; 0: none.
+        root: directory of all rows of a table.
 
     Source: none.
     """
@@ -64,6 +65,7 @@ class Cell:
     score: ScoreConfig = field(default_factory=ScoreConfig)
     out_dir: str = ""
     trials: int = 0
+    root: str = "runs/baselines"
 
     @classmethod
     def of(cls, method: str, words: Sequence[str] = ()) -> Cell:
@@ -99,12 +101,13 @@ class Cell:
     def directory(self) -> Path:
         """Where the row lies: ``out_dir``, or one that names what determines it."""
         name = "-".join([self.method, *(o.replace("=", "-").replace("/", "_") for o in self.options), *([f"trials-{self.trials}"] if self.trials else [])])
-        return Path(self.out_dir or f"runs/baselines/{folder_of(self.env)}/{self.budget}/{name}/{self.seed}")
+        return Path(self.out_dir or f"{self.root}/{folder_of(self.env)}/{self.budget}/{name}/{self.seed}")
 
     def describe(self) -> dict[str, Any]:
         """Plain values that determine the row; where it lies is not among them."""
         body = asdict(self)
-        body.pop("out_dir")
+        for where in ("out_dir", "root"):
+            body.pop(where)
         if not self.trials:
             body.pop("trials")
         body["options"] = list(self.options)

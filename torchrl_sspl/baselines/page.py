@@ -14,7 +14,8 @@ import torch
 
 from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell, of_this_version
 from torchrl_sspl.baselines.scoring import NOMINALS
-from torchrl_sspl.baselines.table import Row, budget_of, markdown, name_of, table, tables
+from torchrl_sspl.baselines.table import Row, budget_of, markdown, name_of, table, tables, values
+from torchrl_sspl.configs.reader import parse
 from torchrl_sspl.errors import MissingDependencyError, OutputError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.animation import Scene, Take, animate
@@ -25,7 +26,6 @@ from torchrl_sspl.viz.report import figure_picture, film_picture
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-DIRECTORY = Path("runs/baselines")
 _COLUMNS, _LETTERS = 5, 30  # of the figure, and of a line above one of its pictures
 _AFTER = 0.5  # s, for which what went wrong is still looked at
 #: Outside the kernel, in it and not claimed, claimed in it, claimed outside of it.
@@ -33,22 +33,23 @@ _COLOURS = ("#ffffff", "#cfd6e4", "#4c9f70", "#c0392b")
 
 
 def main(words: Sequence[str]) -> int:
-    """Measure what is missing of a table, print it, and write it, the page and all rows that there are; 0. Source: none."""
+    """Measure what is missing of a table, print it, and write it, the page and all rows that there are into ``out_dir``; 0. Source: none."""
     rows = table(words)
-    text = markdown(rows)
+    text, directory = markdown(rows), Path(parse(list(words)).get("out_dir") or Cell.root)
     print(text)
-    write(DIRECTORY / "table.md", text)
+    write(directory / "table.md", text)
     every = []
-    for path in sorted(DIRECTORY.rglob(ROW_FILE)):
+    for path in sorted(directory.rglob(ROW_FILE)):
         try:
             every.append(of_this_version(json.loads(path.read_text()), path))
         except ValueError as error:
             print(f"left out: '{path}' cannot be read ({error}); remove it", file=sys.stderr)
         except OutputError as error:
             print(f"left out: {error}", file=sys.stderr)
-    write(DIRECTORY / "rows.json", json.dumps(every, indent=1) + "\n")
+    write(directory / "rows.json", json.dumps(every, indent=1) + "\n")
+    write(directory / "rows.csv", values(every))
     try:
-        page(rows, DIRECTORY / "table.html")
+        page(rows, directory / "table.html")
     except MissingDependencyError as error:
         print(f"no page: {error}", file=sys.stderr)
     return 0
@@ -101,7 +102,8 @@ def failures(cells: Sequence[Cell], path: Path) -> Path | None:
 
     Shown is an episode from a start that could be kept safe, if there is one, up to half a second in U. Source: none.
     """
-    found = [(title.replace("\n", ", "), nominal, kept) for title, kept in _first(cells).items() if (nominal := _failed_under(kept))]
+    failed = [cell for cell in cells if (kept := cell.directory / CLAIMS_FILE).is_file() and _failed_under(kept)]
+    found = [(title.replace("\n", ", "), _failed_under(kept), kept) for title, kept in _first(failed).items()]
     if not found:
         return None
     env = cells[0].environment()
@@ -130,11 +132,11 @@ def _failure(env: Any, title: str, nominal: str, path: Path) -> Scene:
 
 def _first(cells: Sequence[Cell]) -> dict[str, Path]:
     """Where the claims of the first measured seed of every method and budget lie, by their titles."""
-    first: dict[str, Path] = {}
+    first: dict[tuple[str, str], Cell] = {}
     for cell in cells:
         if (cell.directory / CLAIMS_FILE).is_file():
-            first.setdefault(f"{name_of(cell)}\n{budget_of(cell)}, seed {cell.seed}", cell.directory / CLAIMS_FILE)
-    return first
+            first.setdefault((name_of(cell), budget_of(cell)), cell)
+    return {f"{name}\n{budget}, seed {cell.seed}": cell.directory / CLAIMS_FILE for (name, budget), cell in first.items()}
 
 
 def _slice(path: Path) -> tuple[Any, tuple[float, ...]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import itertools
 import os
 import sys
@@ -9,6 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from dataclasses import replace
 from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
@@ -66,7 +69,7 @@ _NEEDED = (
 
 
 def cells(words: Sequence[str]) -> list[Cell]:
-    """The cells that words ask for: ``methods=a,b:key=value env=pendulum,dubins budget=small seed=0,1 trials=8 score.*``.
+    """The cells that words ask for: ``methods=a,b:key=value env=pendulum,dubins budget=small seed=0,1 trials=8 out_dir=runs/baselines score.*``.
 
     Raises ConfigError for a word that is not valid. Source: none.
 
@@ -76,9 +79,9 @@ def cells(words: Sequence[str]) -> list[Cell]:
     """
     given = parse(list(words))
     scores = [f"{k}={v}" for k, v in given.items() if k.startswith("score.")]
-    unknown = [k for k in given if k not in ("methods", "env", "budget", "seed", "trials") and not k.startswith("score.")]
+    unknown = [k for k in given if k not in ("methods", "env", "budget", "seed", "trials", "out_dir") and not k.startswith("score.")]
     if unknown:
-        raise ConfigError(f"table: expected methods=, env=, budget=, seed=, trials= and score.*=, received {', '.join(unknown)}")
+        raise ConfigError(f"table: expected methods=, env=, budget=, seed=, trials=, out_dir= and score.*=, received {', '.join(unknown)}")
     found: dict[Path, Cell] = {}
     for env in given.get("env", "pendulum,dubins").split(","):
         if env not in DEFAULTS and "methods" not in given:
@@ -92,6 +95,7 @@ def cells(words: Sequence[str]) -> list[Cell]:
             if trained_before(options):
                 budget = "small"  # a name alone: nothing is learnt with it
             cell = Cell.of(method, [f"env={env}", f"budget={budget}", f"seed={seed}", f"trials={given.get('trials', '0')}", *options, *scores])
+            cell = replace(cell, root=given.get("out_dir") or cell.root)
             found[cell.directory] = cell
     return list(found.values())
 
@@ -215,6 +219,21 @@ def markdown(rows: Sequence[tuple[Cell, Row]]) -> str:
     return "\n".join(text)
 
 
+def values(rows: Sequence[dict[str, Any]]) -> str:
+    """What the tables show of each row, one line each, as comma-separated values. Source: none."""
+    shown = [name for _, name, *_ in _MEASURED]
+    shown += [f"shifted_{shift}_{name}" for shift in _SHIFTS for name in (*shown[:3], "common_harmless_enter")]
+    lines = [["env", "method", "budget", "seed", *shown]]
+    for row in rows:
+        of = row["cell"]
+        cell = Cell(of["method"], of["env"], of["budget"], of["seed"], tuple(of["options"]), trials=of.get("trials", 0))
+        found = [row["measurements"].get(name, {}).get("value") for name in shown]
+        lines.append([cell.env, name_of(cell), budget_of(cell), str(cell.seed), *("" if v is None else f"{v:.6g}" for v in found)])
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(lines)
+    return text.getvalue()
+
+
 def _on_shift(rows: list[dict[str, Any]], shift: str) -> str:
     """What a method claims on shifted pictures, or what its episodes come to if it claims nothing anywhere."""
     lost = f"shifted_{shift}_common_harmless_enter"
@@ -255,4 +274,4 @@ def _latency(rows: list[dict[str, Any]]) -> str:
     return f"{p50:.1f} / {p99:.1f} ms"
 
 
-__all__ = ["DEFAULTS", "TICKS", "Row", "budget_of", "cells", "markdown", "name_of", "table", "tables"]
+__all__ = ["DEFAULTS", "TICKS", "Row", "budget_of", "cells", "markdown", "name_of", "table", "tables", "values"]
