@@ -282,6 +282,7 @@ def test_compare_writes_a_page_beside_the_runs(tmp_path, capsys):
     assert "gone" in capsys.readouterr().err
 
 
+@pytest.mark.slow  # the examples go the same way
 def test_from_words_to_report_and_evaluated_again(tmp_path, capsys):
     pytest.importorskip("matplotlib")
     assert cli.main(["train", "env=pendulum", *TINY, f"out_dir={tmp_path}/run"]) == 0, capsys.readouterr().err

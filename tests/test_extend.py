@@ -154,6 +154,7 @@ def test_a_rival_is_measured_by_the_same_call(use):
         assert found[name] is None
 
 
+@pytest.mark.slow
 def test_a_phase_takes_the_place_of_another(use):
     agent = use("my_phase.py")["agent"]
     rows = [json.loads(line) for line in Path("runs/calm/log.jsonl").read_text().splitlines()]

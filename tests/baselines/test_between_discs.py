@@ -38,6 +38,7 @@ def test_the_nominal_policy_reaches_goals_and_hits_what_it_does_not_know(benchma
     assert blind["episodes"] == 3
 
 
+@pytest.mark.slow
 def test_an_episode_ends_at_the_goal_and_where_the_car_leaves(benchmark):
     env = CMUTwoDiscsEnv([1], image_size=32)
     start = torch.tensor([[1.05, 0.0, 0.0, 0.0], [1.4, 1.2, 0.0, 0.0]])

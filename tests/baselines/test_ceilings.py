@@ -55,6 +55,7 @@ def test_the_depth_barrier_with_published_constants_is_safe_and_holds_half_of_th
     assert found["claimed_harmless_infeasible"] == 0.0
 
 
+@pytest.mark.slow
 def test_a_lighter_weight_of_the_speed_claims_more_and_fails(pendulum):
     found = measured(pendulum, "depth", "beta=0.5")
     assert found["claimed_over_kernel"] == pytest.approx(0.824, abs=0.03)
@@ -85,7 +86,7 @@ def test_noise_on_the_state_breaks_a_perfect_filter(pendulum):
     assert measured(pendulum, "depth", "noise=[0.02,0.1]", grid=41, horizon=200, episodes=50)["claimed_harmless_enter"] > 0.9
 
 
-@pytest.mark.parametrize("system", ["pendulum", "dubins"])
+@pytest.mark.parametrize("system", ["pendulum", pytest.param("dubins", marks=pytest.mark.slow)])
 def test_the_true_kernel_claims_itself_and_keeps_it(system, request):
     given = request.getfixturevalue(system)
     found = measured(given, "kernel", grid=61 if system == "pendulum" else 21)

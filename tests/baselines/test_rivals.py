@@ -389,7 +389,7 @@ def taken_at_most(config) -> tuple[int, int]:
     return max(s.transitions, config.trainer.total_frames) + rollouts, rollouts
 
 
-@pytest.mark.parametrize("draws", [1, 3])
+@pytest.mark.parametrize("draws", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_a_training_whose_rollouts_all_end_far_from_the_set_takes_what_is_asked_for(draws, tmp_path, monkeypatch):
     monkeypatch.setattr("torchrl_sspl.trainers.synthesis._NEAR", -math.inf)
     run = Experiment(compose([*TINY_RUN, f"synthesis.near_draws={draws}", f"out_dir={tmp_path}"]))

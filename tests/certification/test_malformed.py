@@ -185,6 +185,7 @@ def test_there_are_enough_malformed_files():
     assert len(MALFORMED) >= 100
 
 
+@pytest.mark.slow  # every file is read without one
 def test_the_command_ends_without_a_traceback(issued, tmp_path):
     directory = copied(issued, tmp_path)
     (directory / "certificate.json").write_text("[" * 100_000)

@@ -11,7 +11,7 @@ from .checks import CHECKS
 
 def _runs() -> list:
     """Every check on every loss; capturing the parts of the total loss one by one takes its time."""
-    fast = {"deviation", "lipschitz", "sspl-sound"}
+    fast = {"deviation", "lipschitz"}
     return [
         pytest.param(
             name,

@@ -129,6 +129,7 @@ def test_what_takes_the_place_of_others_has_a_camera_of_its_own():
     assert not torch.equal(*seen)
 
 
+@pytest.mark.slow
 def test_a_training_sees_changed_pictures_and_another_one_the_same(tmp_path):
     words = [*SINGLE, "synthesis.enabled=false", "evaluation.episodes=0"]
 

@@ -402,6 +402,7 @@ def test_an_agent_that_tolerates_errors_is_certified_at_the_level_that_it_keeps(
     assert certify(agent, None, budget=SHORT).level == 0.0
 
 
+@pytest.mark.slow
 def test_measuring_all_again_fails_where_nothing_can_be_measured(tmp_path):
     agent = line_agent()
     agent.save(tmp_path)
@@ -450,6 +451,7 @@ def test_part_of_the_blocks_is_said_to_be_a_part(tmp_path, monkeypatch):
     assert "    measured" not in text[text.index("statistical") :]
 
 
+@pytest.mark.slow
 def test_a_certificate_is_issued_again_with_its_own_settings(tmp_path):
     agent = line_agent()
     agent.save(tmp_path / "agent")

@@ -232,6 +232,7 @@ def test_who_leaves_where_that_counts_as_u_has_entered_it():
     assert found["labelled_safe_rollouts_touch_unsafe"] == 1.0
 
 
+@pytest.mark.slow
 def test_steps_that_nobody_looked_at_are_not_counted(monkeypatch):
     """A car that has left its arena stands still, and nothing is asked of it."""
 

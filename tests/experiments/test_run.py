@@ -283,6 +283,7 @@ def test_descriptions_follow_what_a_predicate_reads():
     assert describe(type("A", (Near,), {"gain": 1.0})) != describe(type("A", (Near,), {"gain": 2.0}))
 
 
+@pytest.mark.slow
 def test_another_predicate_behind_the_same_path_or_another_encoder_is_refused(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     sets = "from evaluation.systems import Lane as make\nBORDER = [{}]\ndef safe(o, i): return o[0] < 3\ndef unsafe(o, i): return o[0] >= BORDER[0]\n"
@@ -414,6 +415,7 @@ def test_environments_without_labels_are_refused(tmp_path):
         Experiment(compose([*SMALL, f"out_dir={tmp_path}"]), unlabelled)
 
 
+@pytest.mark.slow
 def test_a_run_without_checkpoints_is_not_mixed_with_one_that_has_them(tmp_path):
     words = ["trainer.total_frames=64", "synthesis.enabled=false", "evaluation.calibrate=false", f"out_dir={tmp_path}"]
     Experiment(compose([*SMALL, *words]), lane).train()
@@ -431,6 +433,7 @@ def test_an_agent_is_not_measured_in_the_folder_of_a_run_that_was_trained(tmp_pa
         experiment.run()
 
 
+@pytest.mark.slow
 def test_nothing_is_measured_where_that_is_asked_for(tmp_path):
     words = ["trainer.total_frames=64", "synthesis.enabled=false", "evaluation.calibrate=false", "evaluation.episodes=0", UNSAVED, f"out_dir={tmp_path}"]
     outcome = Experiment(compose([*SMALL, *words]), lane).run()

@@ -121,6 +121,7 @@ def test_the_car_is_shown_by_heading_and_its_walks_from_its_own_description(tmp_
     assert "not measured" in page
 
 
+@pytest.mark.slow
 def test_a_system_known_by_being_run_only_is_shown_by_its_episodes(pendulum, tmp_path):
     agent = pendulum[0]
     found = evaluate_episodes(agent, partial(PendulumEnv, image_size=16), SIZES)
@@ -134,6 +135,7 @@ def test_a_system_known_by_being_run_only_is_shown_by_its_episodes(pendulum, tmp
     assert list((tmp_path / "figures").glob("episode.*"))
 
 
+@pytest.mark.slow
 def test_what_acts_without_a_barrier_gets_a_report_of_what_can_be_measured(pendulum, tmp_path):
     _, env, kernel, _ = pendulum
 

@@ -192,6 +192,7 @@ def test_an_exported_program_chooses(tmp_path):
     assert len(wanted.unique()) > 3
 
 
+@pytest.mark.slow  # the exported program does
 def test_an_exported_onnx_file_chooses(tmp_path):
     pytest.importorskip("onnxscript")
     pytest.importorskip("onnxruntime")

@@ -65,6 +65,7 @@ def test_it_is_built_again_from_its_arguments(scene):
     assert torch.equal(twin(pixels), encoder(pixels))
 
 
+@pytest.mark.slow  # as those of other encoders
 def test_its_agents_are_exported_for_batches_of_any_size(scene, tmp_path):
     encoder, pixels = scene
     agent = Agent.from_networks(encoder, LatentDynamics(3, 1), SandwichBarrier(3, (8,)), Policy(3, 1), gain=0.2)

@@ -100,6 +100,7 @@ def test_the_shipped_agents_say_their_periods():
     assert [_about(load(name))["dt"] for name in ("pendulum", "quadruped")] == [0.05, 0.1]
 
 
+@pytest.mark.slow  # files of ONNX are
 def test_programmes_of_torch_are_checked_too(tmp_path):
     agent = load("pendulum")
     assert agent.export(tmp_path / "deep" / "agent.pt2", check=8).is_file()

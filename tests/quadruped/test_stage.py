@@ -26,6 +26,7 @@ def bodies():
         env.close()
 
 
+@pytest.mark.slow
 def test_another_process_draws_the_same_pictures_of_every_job_in_whatever_order_they_are_asked_for(bodies):
     options = {"obstacle_half_size": 0.2, "areas": [(2.0, (0.0, 0.0), (10, 20, 30))]}
     here, there = Stage(48, **options), StageProcess(48, **options)

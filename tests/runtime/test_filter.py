@@ -138,6 +138,7 @@ def test_where_no_action_keeps_the_margin_it_is_the_agents_own():
     assert float(protect(torch.tensor([[0.45]]), torch.tensor([[1.0]])).action) == pytest.approx(0.4)
 
 
+@pytest.mark.slow  # the compiled monitor is held to the plain one, and no module breaks its graph
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")
 def test_a_compiled_shield_takes_what_the_plain_one_takes():
     g = torch.Generator().manual_seed(0)
@@ -375,7 +376,7 @@ def vectorised(lengths: tuple[int, ...], mode: AutoresetMode, **options: Any) ->
     return SafetyVectorWrapper(SyncVectorEnv([partial(Short, k) for k in lengths], autoreset_mode=mode), load("pendulum"), **options)
 
 
-@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP])
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, pytest.param(AutoresetMode.SAME_STEP, marks=pytest.mark.slow)])
 def test_rows_of_a_vectorised_environment_are_protected_as_single_ones(mode):
     """Row by row what the wrapper of single environments does, resets included; at a level at which the nearest action does not hang on
     the last digits of the barrier, which a batch rounds otherwise."""

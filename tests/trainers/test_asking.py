@@ -199,7 +199,7 @@ def test_what_is_of_u_is_inferred_from_labels_of_u_and_pictures_without_any(code
         infer_unsafe(torch.rand(2, 2), torch.tensor(codes), torch.ones(2, dtype=torch.bool))
 
 
-@pytest.mark.parametrize(("words", "inferred"), [(["labels.share=0.5"], True), ([], False)])
+@pytest.mark.parametrize(("words", "inferred"), [(["labels.share=0.5"], True), pytest.param([], False, marks=pytest.mark.slow)])
 def test_a_run_with_few_labels_infers_what_else_is_of_u(words, inferred, tmp_path, monkeypatch):
     asked = []
 

@@ -479,6 +479,7 @@ def _networks():
     return LatentDynamics(2, 1, (8,)), SandwichBarrier(2, (8,)), Policy(2, 1, (8,))
 
 
+@pytest.mark.slow
 def test_changes_of_the_action_are_a_term_of_the_fine_tuning_where_they_are_asked_for(tmp_path):
     for coefficient, logged in ((0.0, False), (0.5, True)):
         folder = tmp_path / str(coefficient)
@@ -496,6 +497,7 @@ class Count(Phase):
         self.seen = int(work.unsafe().sum())
 
 
+@pytest.mark.slow
 def test_phases_can_be_left_out_and_added_to(tmp_path):
     found = experiment(tmp_path)
     found.train()

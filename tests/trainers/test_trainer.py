@@ -96,7 +96,7 @@ def test_training_moves_every_network_and_follows_with_the_delayed_ones() -> Non
         assert any(not torch.equal(before[name], after[name]) for name in names), network
 
 
-@pytest.mark.parametrize("lmi", [False, True], ids=["sandwich", "lmi"])
+@pytest.mark.parametrize("lmi", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["sandwich", "lmi"])
 def test_resume_ends_with_the_weights_of_an_uninterrupted_run(tmp_path: Path, lmi: bool) -> None:
     options: dict[str, Any] = {"lmi": lmi, "with_margins": True, "warm_start_steps": 6}
     straight = build(tmp_path / "straight", **options)

@@ -79,6 +79,7 @@ def test_a_page_is_served_and_every_step_arrives_with_its_number():
     assert events[-1]["picture"].startswith("data:image/png;base64,")
 
 
+@pytest.mark.slow
 def test_random_actions_enter_u_and_behind_the_filter_they_do_not():
     _, bare, counts = seen(policy="random", steps=80)
     assert counts["entered"] > 0
