@@ -49,6 +49,7 @@ def test_an_episode_ends_at_the_goal_and_where_the_car_leaves(benchmark):
     assert found["jerk"] == 0.0
 
 
+@pytest.mark.slow
 def test_it_counts_what_a_filter_changes(benchmark):
     env = CMUTwoDiscsEnv([1], image_size=32)
     perfect = make("kernel")

@@ -101,6 +101,7 @@ def test_the_true_kernel_claims_itself_and_keeps_it(system, request):
     assert torch.equal(method.claims(states), kernel.contains(states))
 
 
+@pytest.mark.slow
 def test_the_cone_is_conservative_and_the_turning_circle_is_not(dubins):
     cone, circle = (measured(dubins, name, grid=31) for name in ("cone", "turning_circle"))
     assert cone["claimed_over_kernel"] == pytest.approx(0.753, abs=0.04)

@@ -136,7 +136,7 @@ def test_faults_are_named():
         Disc([0.0, 0.0], -1.0)
 
 
-@pytest.mark.parametrize(("max_yaw_rate", "shell"), [pytest.param(1.0, 0.064, marks=pytest.mark.slow), (1.25, 0.054), pytest.param(2.0, 0.0375, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("max_yaw_rate", "shell"), [pytest.param(1.0, 0.064, marks=pytest.mark.slow), pytest.param(1.25, 0.054, marks=pytest.mark.slow), pytest.param(2.0, 0.0375, marks=pytest.mark.slow)])
 def test_doomed_share_of_free_space(max_yaw_rate, shell):
     env = DubinsEnv(max_yaw_rate=max_yaw_rate, image_size=32)
     kernel = viability_kernel(env, resolution=[61, 61, 36])

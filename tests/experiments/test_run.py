@@ -358,6 +358,7 @@ def test_advice_follows_the_reasons(tmp_path):
     assert len(said("UNDECIDED", "UNSAFE_INSIDE")) == 2
 
 
+@pytest.mark.slow
 def test_an_agent_of_a_system_in_code_is_not_measured_on_another(tmp_path):
     build(tmp_path, "trainer.total_frames=128").train()
     with pytest.raises(CheckpointError, match="it was given in code; call evaluate_episodes"):

@@ -133,6 +133,7 @@ def test_what_a_phase_without_steps_had_found_is_not_found_again(tmp_path, unint
     assert not (tmp_path / journal_module.FOLDER).exists()
 
 
+@pytest.mark.slow
 def test_targets_are_not_computed_again_in_the_middle_of_their_fit(tmp_path, uninterrupted, monkeypatch):
     whole, expected = uninterrupted
     monkeypatch.setattr(journal_module, "_SHORT", 0.0)

@@ -152,7 +152,7 @@ def test_the_fine_tuning_asks_for_u_as_changed(uninterrupted):
     assert all(float((known - z).norm(dim=1).min()) < 1e-6 for z in asked[-1][2])
 
 
-@pytest.mark.parametrize(("checkpoints", "phase"), [(11, "steady"), pytest.param(15, "changes", marks=pytest.mark.slow), pytest.param(16, "gather", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(("checkpoints", "phase"), [pytest.param(11, "steady", marks=pytest.mark.slow), pytest.param(15, "changes", marks=pytest.mark.slow), pytest.param(16, "gather", marks=pytest.mark.slow)])
 def test_it_resumes_bit_for_bit_with_the_pictures_that_are_needed(tmp_path, uninterrupted, checkpoints, phase):
     whole, expected, _ = uninterrupted
     assert whole.store.augmentation is None

@@ -329,6 +329,7 @@ def test_the_world_model_alone_has_the_terms_of_the_whole_and_zeros() -> None:
     assert all(float(alone[name]) == 0.0 for name in others)
 
 
+@pytest.mark.slow
 def test_checkpoints_come_by_time(tmp_path: Path) -> None:
     trainer = build(tmp_path, checkpoint_seconds=3600.0)
     saved, save = [], trainer._save_trainer
