@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import pickle
 import subprocess
 import sys
@@ -412,7 +413,8 @@ def test_what_gymnasium_needs_is_named(monkeypatch):
         gymnasium_env("LunarLander-v3", "builtins:callable", "builtins:callable")
 
 
-def test_resolve_leaves_the_path_as_it_was():
+def test_resolve_leaves_the_path_as_it_was(monkeypatch):
+    monkeypatch.setattr(sys, "path", [os.getcwd(), *sys.path])  # as `python -m` has it
     before = list(sys.path)
     assert resolve("torchrl_sspl.sets.SAFE") == resolve("torchrl_sspl.sets:SAFE") == 1
     with pytest.raises(ConfigError, match="import path"):

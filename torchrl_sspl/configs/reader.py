@@ -365,7 +365,7 @@ def resolve(path: str) -> Any:
             "run from the folder that holds the module, or install it"
         ) from error
     finally:
-        sys.path.remove(here)
+        del sys.path[-1 - sys.path[::-1].index(here)]  # the last one: it may have been there before
 
 
 def _parameters(env: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
