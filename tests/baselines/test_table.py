@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import json
 import os
 import signal
@@ -22,10 +23,11 @@ from torchrl_sspl.baselines.__main__ import main
 from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell, run_cell
 from torchrl_sspl.baselines.page import claims, failures, page
 from torchrl_sspl.baselines.registry import METHODS, kind_of
-from torchrl_sspl.baselines.table import DEFAULTS, TICKS, cells, markdown, table
+from torchrl_sspl.baselines.table import _MEASURED, _SHIFTS, DEFAULTS, TICKS, _on_shift, _value, cells, markdown, table
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.interrupts import Interrupted
 
+DOCS = Path(__file__).parents[2] / "docs"
 SMALL = ["score.episodes=10", "score.horizon=5", "score.grid=21", "score.kernel_grid=31", "score.frames=2"]
 
 
@@ -194,6 +196,21 @@ def test_a_page_has_systems_of_more_coordinates_and_systems_of_a_file(tmp_path, 
     row = run_cell(Cell.of("lqr", [f"out_dir={tmp_path / 'row'}", *SMALL]))
     page([(cell, row)], tmp_path / "table.html")
     assert films == [tmp_path / "failures-car.mp4"]
+
+
+def test_the_page_says_what_its_data_say():
+    """Of the rows in comparison.csv; the page has others, which were measured before there was such a file."""
+    groups: dict[tuple[str, ...], list] = {}
+    with (DOCS / "images" / "comparison.csv").open() as file:
+        for line in csv.DictReader(file):
+            measured = {name: {"value": float(value)} for name, value in line.items() if value and name not in ("env", "method", "budget", "seed")}
+            groups.setdefault((line["env"], line["method"], line["budget"]), []).append({"measurements": measured})
+    page_text = (DOCS / "comparison.md").read_text()
+    assert groups
+    for (env, method, budget), rows in groups.items():
+        part = page_text.split(f"\n**{env}**\n", 1)[1].split("\n**dubins**\n", 1)[0]
+        assert f"| {' | '.join([method, budget, *(_value(rows, column) for column in _MEASURED)])} |" in part
+        assert f"| {' | '.join([method, budget, *(_on_shift(rows, shift) for shift in _SHIFTS)])} |" in part
 
 
 def test_several_seeds_are_a_mean_and_the_worst():
