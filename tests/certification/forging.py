@@ -10,7 +10,7 @@ from typing import Any
 
 from analytic import Line
 
-from torchrl_sspl.certification.certificate import configuration_digest
+from torchrl_sspl.certification.certificate import Layer, Statement, configuration_digest
 from torchrl_sspl.evaluation.certify import verify_run
 
 Body = dict[str, Any]
@@ -53,3 +53,9 @@ def to(name: str, layer: str = "deterministic", /, **values: Any) -> Callable[[B
         statement(body, name, layer).update(values)
 
     return change
+
+
+def verdicts(body: Body) -> None:
+    """Verdicts as the statements give them."""
+    for layer in body["layers"].values():
+        layer["verdict"] = Layer(layer["name"], [Statement(**s) for s in layer["statements"]]).verdict

@@ -15,11 +15,11 @@ from typing import Any
 import pytest
 import torch
 from analytic import SIDE, Line, line_agent
-from forging import Body, copied, read, statement, to, verify, write
+from forging import Body, copied, read, statement, to, verdicts, verify, write
 from safetensors.torch import load_file, save_file
 
 from torchrl_sspl.certification.branch_and_bound import Budget
-from torchrl_sspl.certification.certificate import Certificate, Reason, weights_digest
+from torchrl_sspl.certification.certificate import Reason, weights_digest
 from torchrl_sspl.certification.record import NOTHING, Record
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.errors import CheckpointError
@@ -38,14 +38,6 @@ def refuted(tmp_path_factory) -> Path:
     agent.save(directory)
     certify(agent, None, name="line", level=0.0).save(directory / "certificate.json")
     return directory
-
-
-def verdicts(body: Body) -> None:
-    """Verdicts as the statements give them."""
-    for layer in body["layers"].values():
-        layer["verdict"] = Certificate.from_dict.__globals__["Layer"](
-            layer["name"], [Certificate.from_dict.__globals__["Statement"](**s) for s in layer["statements"]]
-        ).verdict
 
 
 def nearly(name: str, layer: str, /) -> Callable[[Body], None]:

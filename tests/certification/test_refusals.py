@@ -116,8 +116,8 @@ DETERMINISTIC: dict[str, tuple[Callable[[dict[str, Any]], Any], Reason]] = {
     "policy with an offset": (lambda p: last_bias(p["policy"].net, 0.5), Reason.NOT_INVARIANT),
     "plant that is stronger than its policy": (lambda p: p["dynamics"].net[0].weight.data[:, 0].mul_(2.0), Reason.NOT_INVARIANT),
     "plant that drifts": (lambda p: p["dynamics"].net[-1].bias.data[1].fill_(0.4), Reason.NOT_INVARIANT),
-    "more error required than is tolerated": (change(required_error=0.2), Reason.MARGIN_TOO_SMALL),
-    "a little more error required": (change(required_error=0.14), Reason.MARGIN_TOO_SMALL),  # .007 more
+    "more error required than is tolerated": (change(required_error=0.14), Reason.MARGIN_TOO_SMALL),
+    "much more error required than is tolerated": (change(required_error=0.2), Reason.MARGIN_TOO_SMALL),
     "domain too small for the dynamics": (change(low=-0.3, high=0.3), Reason.LEAVES_DOMAIN),
     "level above zero": (change(level=0.1), Reason.LEVEL),
     "level below everything": (change(level=-0.6), Reason.EMPTY),
@@ -131,7 +131,8 @@ DETERMINISTIC: dict[str, tuple[Callable[[dict[str, Any]], Any], Reason]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "a little more error required" else n for n in DETERMINISTIC])
+# What is required and missed by .007 alone takes the search 14 s.
+@pytest.mark.parametrize("name", [pytest.param(n, marks=pytest.mark.slow) if n == "more error required than is tolerated" else n for n in DETERMINISTIC])
 def test_deterministic_layer_refuses(name):
     breaking, reason = DETERMINISTIC[name]
     twin = parts()

@@ -8,8 +8,7 @@ from typing import Any
 import pytest
 import torch
 from analytic import Line, line_agent
-from forging import Body, copied, read, statement, to, verify, write
-from test_forgeries import verdicts
+from forging import Body, copied, read, statement, to, verdicts, verify, write
 
 from torchrl_sspl.certification.branch_and_bound import Budget
 from torchrl_sspl.certification.certificate import EVERY_WAY, Certificate, Reason, differences

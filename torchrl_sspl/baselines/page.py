@@ -15,7 +15,6 @@ import torch
 from torchrl_sspl.baselines.cell import CLAIMS_FILE, ROW_FILE, Cell, of_this_version
 from torchrl_sspl.baselines.scoring import NOMINALS
 from torchrl_sspl.baselines.table import Row, budget_of, markdown, name_of, table, tables, values
-from torchrl_sspl.configs.reader import parse
 from torchrl_sspl.errors import MissingDependencyError, OutputError
 from torchrl_sspl.files import write
 from torchrl_sspl.viz.animation import Scene, Take, animate
@@ -35,7 +34,7 @@ _COLOURS = ("#ffffff", "#cfd6e4", "#4c9f70", "#c0392b")
 def main(words: Sequence[str]) -> int:
     """Measure what is missing of a table, print it, and write it, the page and all rows that there are into ``out_dir``; 0. Source: none."""
     rows = table(words)
-    text, directory = markdown(rows), Path(parse(list(words)).get("out_dir") or Cell.root)
+    text, directory = markdown(rows), Path(rows[0][0].root)
     print(text)
     write(directory / "table.md", text)
     every = []
@@ -102,22 +101,24 @@ def failures(cells: Sequence[Cell], path: Path) -> Path | None:
 
     Shown is an episode from a start that could be kept safe, if there is one, up to half a second in U. Source: none.
     """
-    failed = [cell for cell in cells if (kept := cell.directory / CLAIMS_FILE).is_file() and _failed_under(kept)]
-    found = [(title.replace("\n", ", "), _failed_under(kept), kept) for title, kept in _first(failed).items()]
-    if not found:
+    failed = _first([cell for cell in cells if _failed_under(cell.directory / CLAIMS_FILE)])
+    if not failed:
         return None
     env = cells[0].environment()
-    scenes = (_failure(env, *of) for of in found)
+    scenes = (_failure(env, title.replace("\n", ", "), kept) for title, kept in failed.items())
     return animate(scenes, path, plane=Plane.of(env, env.system.state_names[:2]), fps=round(1 / env.dt))  # type: ignore[arg-type, attr-defined]
 
 
 def _failed_under(path: Path) -> str:
     """The first nominal policy under which a method failed, "" for none."""
+    if not path.is_file():
+        return ""
     with np.load(path) as body:
         return next((n for n in NOMINALS if f"failed_{n}" in body), "")
 
 
-def _failure(env: Any, title: str, nominal: str, path: Path) -> Scene:
+def _failure(env: Any, title: str, path: Path) -> Scene:
+    nominal = _failed_under(path)
     with np.load(path) as body:
         states, grid, viable = (torch.from_numpy(body[name]) for name in (f"failed_{nominal}", "states", "viable"))
         levels = grid.numpy(), {"B": body["claimed"], "kernel": body["viable"]}

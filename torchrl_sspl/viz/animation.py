@@ -117,7 +117,7 @@ class _Drawing:
         self.figure = new_figure(WIDTH / 80, HEIGHT / 80)
         self.figure.set_layout_engine("none")
         self.figure.set_dpi(80)
-        self.figure.text(12 / WIDTH, 1 - 20 / HEIGHT, scene.title, fontsize=13, fontweight="bold", va="center")
+        self.figure.text(12 / WIDTH, 1 - 20 / HEIGHT, scene.title, fontsize=min(13.0, 1000.0 / max(1, len(scene.title))), fontweight="bold", va="center")  # the time stands to its right
         self.moving: list[tuple[Any, Any]] = []  # axes (None: the figure) and artist, in the order in which they are drawn
         self.clock = self._text(None, 1 - 12 / WIDTH, 1 - 20 / HEIGHT, ha="right", va="center", fontsize=11)
         slots = len(self.takes) + (plane is not None)
