@@ -230,6 +230,10 @@ def test_several_seeds_are_a_mean_and_the_worst():
     assert "✗ ✗ ✗ ✗ ✓ ✗" in text
     assert "seeds" not in text
     assert "| 2.0 | nothing | nothing | invariance | ✗" in text
+    tuned = row(0.5) | {"tuning": {"chosen": ["autoencoder_steps=1200", "alpha=0.5"], "needs": {"transitions": 9}}}
+    assert "| ✗ ✗ ✗ ✗ ✓ ✗ | alpha=0.5 |" in markdown([(asked[0], tuned)])  # what is written out as it is by default is left out
+    tuned["tuning"]["chosen"] = []
+    assert "| the defaults |" in markdown([(asked[0], tuned)])
     assert "| nothing or [V] | nothing |" in markdown(list(zip(asked, [row(0.5), row(0.7, "[V]")], strict=True)))  # not of every seed
     text = markdown(list(zip(asked, [row(0.5), "SolverError: no"], strict=True)))
     assert "| latent_cbf (1 of 2 seeds; SolverError: no) | small | 50.0 %" in text  # what is missing is no mean

@@ -28,6 +28,12 @@ def test_every_method_that_learns_has_as_many_valid_trials(name):
     assert draws(name, 4, seed=1) != found or len(kind_of(name).space) == 1
 
 
+def test_the_second_trial_has_the_published_options_where_the_defaults_are_others():
+    assert draws("latent_safe", 8)[1] == ("discount=0.9999", "tau=0.005", "batch=512", "layers=3")
+    assert ("discount=0.9999",) == draws("smooth_latent", 2, named=["tau", "batch", "layers"])[1]
+    assert draws("neural_cbf", 2)[1] != ()
+
+
 def test_a_claim_that_is_not_kept_is_worth_less_than_none():
     env = PendulumEnv()
 

@@ -121,6 +121,7 @@ class SafetyMethod(ABC):
         stages: what stages of ``fit`` have learnt, see :meth:`stage`; trials that fit on the same data share it.
         Config: dataclass of its options.
         space: what is tried where it is tuned, values by option.
+        published: values of the paper by option, where the defaults are others; the second trial has them.
 
     Source: none.
 
@@ -144,6 +145,7 @@ class SafetyMethod(ABC):
     pools: ClassVar[bool] = True
     Config: ClassVar[type | None] = None
     space: ClassVar[dict[str, tuple[Any, ...]]] = {}
+    published: ClassVar[dict[str, Any]] = {}
     needs: Needs = Needs()
 
     def __init__(self, config: Any = None) -> None:

@@ -6,7 +6,7 @@ discounted safety Bellman backup with the discount annealed, a filter that switc
 threshold. Stand-ins: this library's encoder and deterministic latent dynamics (SaLaD, trained with the failure labels alone) in
 place of a recurrent world model of 27 million weights; 21 actions with one Q each, all of them backed up in imagination, in place of
 DDPG; 5 x 10^3 updates in place of 6 x 10^5. Published are a discount that ends at 0.9999, tau of 0.005, a batch of 512 and a Q of three
-layers, ``discount=0.9999 tau=0.005 batch=512 layers=3``: on the cars that finds more than the defaults do.
+layers (``published``): on the cars that finds more than the defaults do.
 """
 
 from __future__ import annotations
@@ -61,6 +61,7 @@ class LatentSafe(SafetyMethod):
     space: ClassVar[dict[str, tuple[Any, ...]]] = {
         "world_steps": (2000, 6000), "discount": (0.98, 0.995, 0.999), "threshold": (0.0, 0.1, 0.2, 0.3), "actions": (21, 41),
     }  # fmt: skip
+    published: ClassVar[dict[str, Any]] = {"discount": 0.9999, "tau": 0.005, "batch": 512, "layers": 3}
 
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """World model, margin, value, one after the other; see :meth:`SafetyMethod.fit`."""

@@ -11,7 +11,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import fields, replace
 from functools import partial
 from multiprocessing import active_children, get_context, parent_process
 from pathlib import Path
@@ -170,7 +170,7 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
         for cell, row in group:
             several.setdefault((name_of(cell), budget_of(cell)), []).append(row)
         lines = [["method", "budget", *(c[0] for c in _MEASURED), "latency p50 / p99", "episodes"]]
-        given = [["method", "budget", *(c[0] for c in _NEEDED), "training, CPU min", "proved", "measured", "only claimed", "paper: " + ", ".join(_TICK_NAMES)]]
+        given = [["method", "budget", *(c[0] for c in _NEEDED), "training, CPU min", "proved", "measured", "only claimed", "paper: " + ", ".join(_TICK_NAMES), "trials chose"]]
         shifted = [["method", "budget", *_SHIFTS]]
         for (label, budget), found in several.items():
             good = [row for row in found if isinstance(row, dict)]
@@ -192,7 +192,7 @@ def tables(rows: Sequence[tuple[Cell, Row]]) -> dict[str, list[tuple[str, list[l
                 minutes += f", and {first['minutes']['trials_cpu']:.1f} of trials"
             ticks = TICKS.get(first["cell"]["method"], "")
             rests = [" or ".join(dict.fromkeys(row["needs"][name] for row in good)) for name in ("proved", "measured", "claimed")]
-            given.append([label, budget, *facts, minutes, *rests, " ".join("✓" if t == "+" else "✗" for t in ticks) or "-"])
+            given.append([label, budget, *facts, minutes, *rests, " ".join("✓" if t == "+" else "✗" for t in ticks) or "-", _chosen(first)])
         every[env] = [("Measured", lines), ("Given", given)]
         if len(shifted) > 1:
             every[env].append(("Shifted pictures: claimed / kernel, false-safe, U called safe; without a claim: common, harmless", shifted))
@@ -267,6 +267,15 @@ def _episodes(rows: list[dict[str, Any]]) -> str:
     if not common or not claimed or min(claimed) >= min(common):
         return str(min([*common, *claimed], default="-"))
     return f"{min(common)}, {min(claimed)} claimed"
+
+
+def _chosen(row: dict[str, Any]) -> str:
+    """Options that trials have chosen, the same for all seeds; those that are written out as they are by default are left out."""
+    if "tuning" not in row:
+        return "-"
+    config = kind_of(row["cell"]["method"]).Config
+    usual = {f"{f.name}={f.default}" for f in fields(config)} if config else set()
+    return " ".join(option for option in row["tuning"]["chosen"] if option not in usual) or "the defaults"
 
 
 def _latency(rows: list[dict[str, Any]]) -> str:

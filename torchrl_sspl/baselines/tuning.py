@@ -23,7 +23,7 @@ LOST = 10.0  # an episode from the claimed set that enters U costs as much as so
 
 
 def draws(method: str, trials: int, seed: int = SEED, *, named: Sequence[str] = ()) -> list[tuple[str, ...]]:
-    """``key=value`` options of each trial: the defaults first, then random draws from the method's ``space``, none drawn twice.
+    """``key=value`` options of each trial: the defaults, the published ones where those are others, then random draws from the method's ``space``, none drawn twice.
 
     A draw may be the defaults, written out; options that are ``named`` are not drawn. A space with fewer points than trials gives fewer trials.
 
@@ -33,8 +33,10 @@ def draws(method: str, trials: int, seed: int = SEED, *, named: Sequence[str] = 
         >>> draws("imitation", 3)[0], len(draws("imitation", 8))
         ((), 4)
     """
-    space, generator = {k: v for k, v in kind_of(method).space.items() if k not in named}, random.Random(seed)
-    found: list[tuple[str, ...]] = [()]
+    kind, generator = kind_of(method), random.Random(seed)
+    space = {k: v for k, v in kind.space.items() if k not in named}
+    published = tuple(f"{k}={v}" for k, v in kind.published.items() if k not in named)
+    found: list[tuple[str, ...]] = [(), published] if published else [()]
     for _ in range(100 * trials):
         if len(found) >= trials:
             break
