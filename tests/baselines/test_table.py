@@ -252,9 +252,14 @@ def test_fewer_episodes_from_the_claimed_set_are_shown():
         }  # fmt: skip
 
     asked = cells(["methods=latent_cbf", "env=pendulum", "seed=0,1"])
-    for counts, shown in ((((200, 200), (200, 3)), "200, 3 claimed"), (((200, 0), (200, 200)), "200"), (((200, None),) * 2, "200")):
+    several = (((200, 200), (200, 3)), "200, 3 claimed"), (((200, 0), (200, 200)), "200"), (((200, None),) * 2, "200"), (((None, 7),) * 2, "7"), (((None, None),) * 2, "-")
+    for counts, shown in several:
         text = markdown([(cell, row(*n)) for cell, n in zip(asked, counts, strict=True)])
         assert f"| 0.0 / 0.0 ms | {shown} |" in text
+    for held, shown in ((3000, "200, calibrated by 3000"), (200, "200")):
+        placed = row(200, 200)
+        placed["measurements"]["calibrated_level"] = {"value": -0.1, "n": held}
+        assert f"| 0.0 / 0.0 ms | {shown} |" in markdown([(asked[0], placed)])
 
 
 def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():

@@ -262,11 +262,13 @@ def _value(rows: list[dict[str, Any]], column: tuple[str, str, bool, Any]) -> st
 
 
 def _episodes(rows: list[dict[str, Any]]) -> str:
-    """From how many starts episodes began, the fewest of the seeds; apart those from the claimed set where fewer were found in it."""
-    common, claimed = ([n for row in rows if (n := row["measurements"].get(f"{name}_harmless_enter", {}).get("n"))] for name in ("common", "claimed"))
-    if not common or not claimed or min(claimed) >= min(common):
-        return str(min([*common, *claimed], default="-"))
-    return f"{min(common)}, {min(claimed)} claimed"
+    """From how many starts episodes began, the fewest of the seeds; apart those from the claimed set where fewer were found in it, and those
+    that placed a calibrated level where they were others."""
+    names = ("common_harmless_enter", "claimed_harmless_enter", "calibrated_level")
+    common, claimed, held = ([n for row in rows if (n := row["measurements"].get(name, {}).get("n"))] for name in names)
+    most = min(common or claimed, default=0)
+    shown = [str(most or "-"), *([f"{min(claimed)} claimed"] if claimed and min(claimed) < most else [])]
+    return ", ".join([*shown, *([f"calibrated by {min(held)}"] if held and min(held) != most else [])])
 
 
 def _chosen(row: dict[str, Any]) -> str:
