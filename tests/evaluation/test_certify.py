@@ -537,7 +537,15 @@ def test_code_that_a_description_names_is_imported_only_if_it_is_trusted(tmp_pat
     ],
 )
 def test_a_system_is_compared_with_its_description(env, same_one):
-    assert blocks.same_system(env, PendulumEnv(batch_size=[1])) == same_one
+    assert blocks.same_system(env, PendulumEnv) == same_one
+
+
+def test_no_system_is_the_one_of_a_description_that_cannot_be_built():
+    unbuildable = described_system({"config": {"env": {"_target_": "torchrl_sspl.envs.PendulumEnv", "max_torque": -1.0}}})
+    assert unbuildable is not None
+    with pytest.raises(ConfigError):
+        unbuildable(batch_size=[1], seed=0)
+    assert not blocks.same_system(PendulumEnv(batch_size=[1]), unbuildable)
 
 
 def test_resets_are_compared_with_their_description():

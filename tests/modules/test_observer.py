@@ -218,6 +218,13 @@ def test_where_nothing_is_proved_no_premise_is_met():
     assert watched([0.0, 0.0], error=0.0) == [False, False]
 
 
+def test_a_picture_without_a_batch_is_not_taken_for_six_systems():
+    controller = small_agent().controller(6)
+    with pytest.raises(ShapeError, match=r"of 6 systems, \(6, 6, H, W\), received \(6, 16, 16\)"):
+        controller.step(frames(1)[0])
+    assert controller.step(frames(6)).action.shape == (6, 1)
+
+
 def test_resets_forget_some_or_all():
     agent = small_agent()
     controller = agent.controller(4)

@@ -69,8 +69,16 @@ def described_system(description: Mapping[str, Any], *, trust: bool = False) -> 
         return None
 
 
-def same_system(env: SafetyEnv, twin: Any) -> bool:
-    """Whether two systems move, look and are labelled the same, on a sample."""
+#: What building and running a system of somebody else's description may raise.
+_UNBUILDABLE = (SSPLError, RuntimeError, TypeError, ValueError, LookupError, AttributeError)
+
+
+def same_system(env: SafetyEnv, factory: MakeEnv) -> bool:
+    """Whether a system moves, looks and is labelled as the one that a maker gives, on a sample; not if that cannot be built."""
+    try:
+        twin = factory(batch_size=[1], seed=0)
+    except _UNBUILDABLE:
+        return False
     if type(env) is not type(twin) or (env.state_dim, env.action_dim) != (twin.state_dim, twin.action_dim):
         return False
     g = torch.Generator().manual_seed(0)
@@ -108,7 +116,7 @@ def same_resets(make_env: MakeEnv, factory: MakeEnv, horizon: int = _COMPARED) -
     try:
         pairs = zip(seen(make_env), seen(factory), strict=True)
         return all(a.shape == b.shape and torch.equal(a, b) for a, b in pairs)
-    except (SSPLError, RuntimeError, TypeError, ValueError, LookupError, AttributeError):
+    except _UNBUILDABLE:
         return False
 
 

@@ -129,7 +129,7 @@ def certify(
     if env is None:
         return _proved(agent, name, level, budget)
     factory = described_system(agent.description)
-    system = "described" if factory is not None and same_system(env, factory([1], 0)) else "given"
+    system = "described" if factory is not None and same_system(env, factory) else "given"
     root, used = _root_seed(agent) if seed is None else seed, _used(agent, used_seeds)
     record = Record("states", system, root, episodes, horizon, 1, confidence, acceptable, used)
     certificate = _proved(agent, name, level, budget)

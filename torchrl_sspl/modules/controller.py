@@ -187,7 +187,7 @@ class Controller:
 
     @torch.no_grad()
     def step(self, pixels: Tensor | None) -> Step:
-        """Actions for pixels ``(n, 6, H, W)`` uint8, frames t-1 and t; a ShapeError for another number of them.
+        """Actions for pixels ``(n, 6, H, W)`` uint8, frames t-1 and t; a ShapeError for another number of them, or for one without a batch.
 
         Without pixels (``None``) the memory goes on with what it expects, and the premise is not met; what would have been seen,
         and its distances, are NaN.
@@ -196,8 +196,8 @@ class Controller:
         if pixels is None:
             latent, nothing = memory.unseen(n), torch.full((n, self.agent.latent_dim), math.nan, device=self._applies.device)
             return self.remember(*self._judged(latent, nothing, nothing), rows=(~self.begins).nonzero()[:, 0])
-        if len(pixels) != n:
-            raise ShapeError(f"expected pixels of {n} systems, received {len(pixels)}; make a controller for them")
+        if pixels.ndim != 4 or len(pixels) != n:
+            raise ShapeError(f"expected pixels of {n} systems, ({n}, 6, H, W), received {tuple(pixels.shape)}; make a controller for them")
         return self.remember(*self._look(pixels.to(self._applies.device), *self.expected()))
 
     def expected(self) -> tuple[Tensor, Tensor]:
