@@ -105,7 +105,7 @@ def test_what_has_been_used_is_not_used_again():
     assert Labels(safe=5).less(7, 0, seed=1).most[SAFE] == 0
 
 
-def test_a_store_holds_no_more_labels_than_it_may():
+def test_a_store_holds_no_more_labels_than_it_may(tmp_path):
     store = TransitionStore(20, labels=Labels(safe=3, unsafe=2))
     for _ in range(4):
         store.extend(rows(codes(1, 2, 0, 1, 2)))
@@ -123,6 +123,10 @@ def test_a_store_holds_no_more_labels_than_it_may():
     last.load_state_dict(store.state_dict())  # of which two labels of S were overwritten
     last.extend(rows(codes(1, 1, 1, 1, 1)))
     assert last.given == {SAFE: 3, UNSAFE: 2}
+    store.dumps(tmp_path)
+    read = TransitionStore.from_folder(tmp_path, labels=Labels(safe=3, unsafe=2))
+    read.extend(rows(codes(1, 2)))
+    assert read.given == {SAFE: 3, UNSAFE: 2}
     plain = TransitionStore(20)
     plain.extend(rows(codes(1, 2, 0)))
     assert plain.get(slice(None))["next", "region"].flatten().tolist() == [1, 2, 0]

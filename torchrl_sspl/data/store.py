@@ -327,13 +327,18 @@ class TransitionStore(Storage):
         self.load_state_dict({**state, "_meta": meta})
 
     @classmethod
-    def from_folder(cls, path: str | os.PathLike[str], *, pixel_views: bool = False) -> TransitionStore:
-        """A store with the content and the capacity of the one that was saved in a folder."""
+    def from_folder(
+        cls, path: str | os.PathLike[str], *, pixel_views: bool = False, augmentation: Augmentation | None = None, labels: Labels | None = None
+    ) -> TransitionStore:
+        """A store with the content and the capacity of the one that was saved in a folder.
+
+        The file does not hold what is to become of transitions that come later: ``augmentation`` and ``labels`` say it again.
+        """
         state, meta = _read(Path(path))
         capacity = meta.get("capacity") if isinstance(meta, dict) else None
         if type(capacity) is not int or capacity < 1:
             raise CheckpointError(f"store: expected a capacity >= 1 in {path}, found {capacity!r:.40}; record it again.")
-        store = cls(capacity, pixel_views=pixel_views)
+        store = cls(capacity, pixel_views=pixel_views, augmentation=augmentation, labels=labels)
         store.load_state_dict({**state, "_meta": meta})
         return store
 
