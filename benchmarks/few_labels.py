@@ -34,7 +34,7 @@ import numpy as np
 import torch
 
 from torchrl_sspl.baselines import Budget, Needs, ScoreConfig, make, score
-from torchrl_sspl.baselines.cell import Cell, folder_of, hash_of
+from torchrl_sspl.baselines.cell import SCHEMA, Cell, folder_of, hash_of, of_this_version
 from torchrl_sspl.baselines.sspl import SSPL, needs_of, recorded_first
 from torchrl_sspl.configs.reader import compose, parse
 from torchrl_sspl.errors import ConfigError
@@ -117,7 +117,7 @@ class Point:
         system = hash_of(self.env)
         with RunDirectory(path.parent).held() as directory:
             if path.is_file():
-                row = json.loads(path.read_text())
+                row = of_this_version(json.loads(path.read_text()), path)
                 if row.get("score") != asdict(sizes):
                     raise ConfigError(f"score: expected {row.get('score')}, with which '{path}' was measured, received {asdict(sizes)}; give the same, or remove the point")
                 if row.get("system", "") != system:
@@ -126,7 +126,7 @@ class Point:
             few = [] if self.labels == "all" else [f"labels.safe={self.labels}", f"labels.unsafe={self.labels}"]
             words = [f"labels.wrong={self.wrong}", *few, *self.options]
             checks, needs, found = (self._run if self.env == "quadruped" else self._row)(words, directory, sizes)
-            row = asdict(self) | {
+            row = {"schema": SCHEMA} | asdict(self) | {
                 "score": asdict(sizes), "passed": float(any(check.passed for check in checks)), "checks": [asdict(check) for check in checks],
                 "needs": asdict(needs), "measurements": found,
             }  # fmt: skip
@@ -199,7 +199,7 @@ def gathered(out: Path) -> list[Line]:
     lines = list[Line]()
     if (out / DATA).is_file():
         lines += [Line.read(row) for row in csv.DictReader((out / DATA).read_text().splitlines())]
-    lines += [line_of(json.loads(path.read_text())) for path in sorted(out.rglob("point.json"))]
+    lines += [line_of(of_this_version(json.loads(path.read_text()), path)) for path in sorted(out.rglob("point.json"))]
     return sorted({line[:6]: line for line in lines}.values(), key=lambda line: (line.env, line.wrong, line.options, line.transitions, line.labels == "all", line.labels.zfill(9), line.seed))
 
 

@@ -13,8 +13,9 @@ import pytest
 from tiny import TINY_PHASES
 
 from torchrl_sspl.baselines import Needs, ScoreConfig
+from torchrl_sspl.baselines.cell import SCHEMA
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, OutputError
 from torchrl_sspl.evaluation.measurements import Evaluation, share
 from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.trainers.phases import Check
@@ -64,7 +65,7 @@ def point(
     counts = {"safe_labels": 100, "unsafe_labels": 100, "neither_labels": 0}
     others = {"false_safe": {"value": None}, "unsafe_called_safe": {"value": 0.1}, "claimed_harmless_enter": {"value": None}, "common_harmless_enter": {"value": 0.0}}
     path.write_text(json.dumps({
-        "env": "pendulum", "labels": labels, "transitions": transitions, "wrong": wrong, "seed": 0, "options": options, "starts": starts,
+        "schema": SCHEMA, "env": "pendulum", "labels": labels, "transitions": transitions, "wrong": wrong, "seed": 0, "options": options, "starts": starts,
         "passed": float(passed), "needs": counts, "measurements": {"claimed_over_kernel": {"value": volume}, **others},
     }))  # fmt: skip
 
@@ -185,6 +186,15 @@ def test_a_point_of_a_file_is_that_of_its_content(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"env: expected '.*mine\.yaml' as it was when '.*point\.json' was measured, received another content"):
         point.measure(path, ScoreConfig())
     assert made["Point"]("../mine.yaml", "20", 640, 0.0, 0, ()).path.parts[:2] == ("up", "mine.yaml")
+
+
+def test_a_point_of_another_version_is_refused(tmp_path, monkeypatch):
+    made = runpy.run_path(str(BENCHMARK))
+    path = tmp_path / "point.json"
+    path.write_text("{}")
+    for read in (lambda: made["Point"]("pendulum", "20", 640, 0.0, 0, ()).measure(path, ScoreConfig()), lambda: made["gathered"](tmp_path)):
+        with pytest.raises(OutputError, match=rf"expected measurements of schema {SCHEMA} in '.*point\.json'.*None"):
+            read()
 
 
 @pytest.mark.slow
