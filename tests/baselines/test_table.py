@@ -206,17 +206,21 @@ def test_the_page_says_what_its_data_say():
             measured = {name: {"value": float(value)} for name, value in line.items() if value and name not in ("env", "method", "budget", "seed")}
             groups.setdefault((line["env"], line["method"], line["budget"]), []).append({"measurements": measured})
     page_text = (DOCS / "comparison.md").read_text()
-    told = set()
-    for (_, method, budget), rows in groups.items():
-        told.add(f"| {' | '.join([method, budget, *(_value(rows, column) for column in _MEASURED)])} |")
+
+    def shown(title: str) -> list[str]:
+        return page_text.partition(f"\n**{title}**\n\n")[2].partition("\n\n")[0].splitlines()[2:]
+
+    told: dict[str, list[str]] = {}
+    for (env, method, budget), rows in groups.items():
+        title = f"{env}, full budget" if budget == "full" else env
+        told.setdefault(title, []).append(f"| {' | '.join([method, budget, *(_value(rows, column) for column in _MEASURED)])} |")
         if budget != "full" and any(name.startswith("shifted_") for row in rows for name in row["measurements"]):
-            assert f"| {' | '.join([method, budget, *(_on_shift(rows, shift) for shift in _SHIFTS)])} |" in page_text
-    assert [line for line in told if line not in page_text] == []
-    heads = "| method | budget | claimed / kernel |"
-    tables = page_text.partition("### What has been measured")[2].partition("### Tuned, and with the full budget")[0].split(heads)[1:]
-    shown = [line for table in tables for line in table.partition("\n\n")[0].splitlines()[2:] if not line.endswith("; before |")]
-    assert len(shown) > 30
-    assert [line for line in shown if not any(line.startswith(one) for one in told)] == []
+            told.setdefault(f"{env}, shifted pictures", []).append(f"| {' | '.join([method, budget, *(_on_shift(rows, shift) for shift in _SHIFTS)])} |")
+    for title, lines in told.items():
+        assert [line for line in lines if not any(one.startswith(line) for one in shown(title))] == [], title
+        if "full" not in title:
+            assert [one for one in shown(title) if not one.endswith("; before |") and not any(one.startswith(line) for line in lines)] == [], title
+    assert {f"{env}{table}" for env in DEFAULTS for table in ("", ", shifted pictures")} <= told.keys()
 
 
 def test_several_seeds_are_a_mean_and_the_worst():

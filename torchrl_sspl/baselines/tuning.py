@@ -1,4 +1,4 @@
-"""Trials: as many random draws from a small space for every method, as far as the space has so many, judged on data that no score sees."""
+"""Trials: as many for every method, as far as its space has so many: defaults, published options, random draws; judged on data that no score sees."""
 
 from __future__ import annotations
 
