@@ -427,6 +427,18 @@ def test_a_run_without_checkpoints_is_not_mixed_with_one_that_has_them(tmp_path)
     assert not list((tmp_path / "checkpoints").glob("*"))
 
 
+def test_a_run_that_begins_anew_does_not_append_to_the_numbers_of_another(tmp_path, monkeypatch):
+    old = [tmp_path / "log.jsonl", tmp_path / "csv" / "scalars" / "grad_norm.csv"]
+    old[1].parent.mkdir(parents=True)
+    for path in old:
+        path.write_text("of another run")
+    experiment = Experiment(compose([*SMALL, "logger=csv", UNSAVED, f"out_dir={tmp_path}"]), lane)
+    monkeypatch.setattr(experiment.trainer, "train", lambda: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        experiment.train()
+    assert not any(path.exists() for path in old)
+
+
 def test_an_agent_is_not_measured_in_the_folder_of_a_run_that_was_trained(tmp_path):
     (tmp_path / "agent").mkdir()
     experiment = Experiment(compose(["env=pendulum", "agent=pendulum", "logger=none", f"out_dir={tmp_path}"]))

@@ -110,6 +110,12 @@ def test_each_run_has_a_directory_in_that_of_the_sweep():
     assert plan(["env=pendulum,dubins", "out_dir=here"])[0] == Path("here")
 
 
+def test_a_directory_that_names_values_of_its_runs_is_used():
+    directory, tasks = plan(["env=pendulum", "seed=0,1", "out_dir=/data/${seed}/x"])
+    assert directory == Path("/data")
+    assert [t.config.out_dir for t in tasks] == ["/data/0/x/seed=0", "/data/1/x/seed=1"]
+
+
 # ---------------------------------------------------------------------- running them
 
 

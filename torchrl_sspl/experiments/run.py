@@ -327,7 +327,8 @@ class Experiment:
                 rotation._remove_atomically(path)
             if not resume:
                 shutil.rmtree(self.directory / "checkpoints", ignore_errors=True)
-            (self.directory / "log.jsonl").unlink(missing_ok=True)
+            for told in (self.directory / "log.jsonl", *(self.directory / "csv" / "scalars").glob("*.csv")):  # they are appended to
+                told.unlink(missing_ok=True)
         write(self.directory / CONFIG_FILE, json.dumps(self.config.to_dict(), indent=1, sort_keys=True) + "\n")
         try:
             if not (self.trainer.resumed and (self.directory / CODE_FILE).is_file()):

@@ -138,9 +138,10 @@ def plan(overrides: Sequence[str]) -> tuple[Path, list[Task]]:
         EnvFactory(config.env)  # raises where there is no such system
         folders.add(config.out_dir)
         tasks.append(Task(name, config, words))
-    directory = Path(folders.pop() if len(folders) == 1 else "runs/sweep")
+    given = "out_dir" in parse(overrides)  # which may hold values of the runs, such as "/data/${seed}"
+    directory = Path(os.path.commonpath(folders) if given or len(folders) == 1 else "runs/sweep")
     for task in tasks:
-        task.config.out_dir = str(directory / task.name)
+        task.config.out_dir = str((Path(task.config.out_dir) if given else directory) / task.name)
         task.words.append(f"out_dir={task.config.out_dir}")
     return directory, tasks
 
