@@ -340,8 +340,9 @@ def _export(words: list[str]) -> int:
     parser = argparse.ArgumentParser(prog="sspl export", description="One step of an agent, for a machine without this library.")
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
     parser.add_argument("file", help="what to write: FILE.onnx or FILE.pt2")
+    parser.add_argument("--image-size", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="of the pictures, for an encoder that takes any size")
     given = parser.parse_args(words)
     from torchrl_sspl.modules.agent import load
 
-    print(load(given.agent).export(given.file))
+    print(load(given.agent).export(given.file, image_size=given.image_size))
     return 0

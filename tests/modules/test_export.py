@@ -148,6 +148,17 @@ def test_the_callers_agent_is_not_touched(tmp_path):
     assert agent.policy.training
 
 
+def test_pictures_have_the_size_that_is_asked_for_where_the_encoder_takes_any(tmp_path):
+    agent = load("pendulum")
+    with pytest.raises(ConfigError, match=r"image_size=\(64, 64\), the one size .* received \(48, 48\)"):
+        agent.export(tmp_path / "agent.pt2", image_size=48)
+    agent.encoder.image_size = None
+    step = torch.export.load(agent.export(tmp_path / "agent.pt2", check=8, image_size=(48, 80))).module()
+    frames = torch.zeros(3, 6, 48, 80, dtype=torch.uint8)
+    assert len(step(frames, torch.zeros(3, 3), torch.zeros(3, 1), torch.ones(3, dtype=torch.bool))) == len(OUTPUTS)
+    assert agent.encoder.image_size is None
+
+
 def test_another_suffix_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"\.onnx or \.pt2"):
         load("pendulum").export(tmp_path / "agent.pth")

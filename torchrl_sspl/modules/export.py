@@ -6,7 +6,7 @@ import copy
 import io
 import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,6 +19,7 @@ from torchrl_sspl.errors import CertificationError, ConfigError, MissingDependen
 from torchrl_sspl.files import write
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.modules.controller import correction, meets_premise
+from torchrl_sspl.modules.networks import as_pair
 
 INPUTS = ("pixels", "latent", "action", "begins")
 OUTPUTS = ("next_action", "barrier", "seen_barrier", "innovation", "met", "next_latent")
@@ -64,7 +65,7 @@ class DeployedStep(nn.Module):
         return agent.policy(now), barrier, of_seen, innovation.norm(dim=-1), met, now
 
 
-def export(agent: Any, path: str | Path, *, check: int = 256) -> Path:
+def export(agent: Any, path: str | Path, *, check: int = 256, image_size: int | Sequence[int] | None = None) -> Path:
     """Writes one step of an agent, :class:`DeployedStep`, for a machine without this library.
 
     The suffix says what: ``.onnx`` for onnxruntime and the like, ``.pt2`` for ``torch.export.load``. The batch is dynamic. An ONNX
@@ -75,8 +76,9 @@ def export(agent: Any, path: str | Path, *, check: int = 256) -> Path:
         agent: frozen agent.
         path: file to write; its folder is created if necessary.
         check: number of random steps on which the file is compared with the agent before this returns; 0: none.
+        image_size: height and width of the pictures in pixels, which the file fixes; ``None``: the encoder's, 64 where it takes any.
 
-    Returns the path. Raises ConfigError for another suffix; MissingDependencyError without the packages of the extra
+    Returns the path. Raises ConfigError for another suffix, or another size than the encoder's; MissingDependencyError without the packages of the extra
     ``onnx``; CertificationError if the file computes something else. Source: none.
 
     Example:
@@ -92,7 +94,8 @@ def export(agent: Any, path: str | Path, *, check: int = 256) -> Path:
         _required("onnxscript")
     step = DeployedStep(copy.deepcopy(agent)).cpu().eval()  # the caller's stays where it is
     dynamic = {name: {0: torch.export.Dim("n")} for name in INPUTS}
-    example = tuple(_steps(agent, 2, 0).values())
+    step.agent.encoder.image_size = _size(agent, image_size)
+    example = tuple(_steps(step.agent, 2, 0).values())
     written = io.BytesIO()
     with torch.no_grad(), warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of the exporters, about themselves
@@ -101,7 +104,7 @@ def export(agent: Any, path: str | Path, *, check: int = 256) -> Path:
             torch.export.save(program, written)
         else:
             made: Any = torch.onnx.export(program, dynamo=True, input_names=list(INPUTS), output_names=list(OUTPUTS), verbose=False)
-            made.model.metadata_props.update({k: json.dumps(v) for k, v in _about(agent).items()})
+            made.model.metadata_props.update({k: json.dumps(v) for k, v in _about(step.agent).items()})
             written.write(made.model_proto.SerializeToString())
     if check:  # before it takes the place of a file that may be right
         _compare(step, written.getvalue(), path.suffix, check)
@@ -145,8 +148,16 @@ def _period(agent: Any) -> float | None:
 
 
 def _picture(agent: Any) -> tuple[int, int, int]:
-    size = getattr(agent.encoder, "image_size", None) or (_SIZE, _SIZE)
-    return 6, int(size[0]), int(size[1])
+    return 6, *_size(agent)
+
+
+def _size(agent: Any, wanted: int | Sequence[int] | None = None) -> tuple[int, int]:
+    """Height and width of the pictures: of the encoder, or what is wanted where it takes any."""
+    own = getattr(agent.encoder, "image_size", None)
+    size = as_pair(wanted or own or _SIZE, "image_size")
+    if own is not None and size != tuple(own):
+        raise ConfigError(f"expected image_size={tuple(own)}, the one size that the encoder takes, received {size}; leave it out")
+    return size
 
 
 def _steps(agent: Any, n: int, seed: int) -> dict[str, Tensor]:

@@ -68,7 +68,8 @@ def mlp(sizes: Sequence[int], activation: type[nn.Module] = nn.ReLU) -> nn.Seque
     return nn.Sequential(*layers[:-1])
 
 
-def _pair(value: int | Sequence[int], name: str) -> tuple[int, int]:
+def as_pair(value: int | Sequence[int], name: str) -> tuple[int, int]:
+    """Height and width of a size; a ConfigError that names the option if it is none."""
     pair = (value, value) if isinstance(value, int) else tuple(value)
     if len(pair) != 2 or min(pair) < 1:
         raise ConfigError(
@@ -153,8 +154,8 @@ class FrameEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.latent_dim = _positive(latent_dim, "latent_dim")
-        self.image_size = None if image_size is None else _pair(image_size, "image_size")
-        self.pool_to = _pair(pool_to, "pool_to")
+        self.image_size = None if image_size is None else as_pair(image_size, "image_size")
+        self.pool_to = as_pair(pool_to, "pool_to")
         self.features = _positive(features, "features")
         self.velocity_gain = float(velocity_gain)
         self.in_channels = _positive(in_channels, "in_channels")
