@@ -70,7 +70,7 @@ class Needs:
         expert_actions: actions of an expert that knows state and dynamics.
         rollouts: transitions under a policy of its own.
         held_out_labels, held_out_steps: fresh pictures, and steps of fresh episodes, whose labels its own checks read.
-            None: not counted, as in the trainings of the shipped agents.
+            None: not counted, as in the trainings of the shipped agents; so are labels and transitions of an agent that does not say them.
         state_at_run_time: whether it reads the true state when it acts.
         dynamics: "none", "control-affine" (f and g are known) or "exact" (the simulator itself).
         proved, measured, claimed: what is proved of the safe set, what held-out episodes decided, and what is only claimed.
@@ -82,10 +82,10 @@ class Needs:
         'none'
     """
 
-    transitions: int = 0
-    safe_labels: int = 0
-    unsafe_labels: int = 0
-    neither_labels: int = 0
+    transitions: int | None = 0
+    safe_labels: int | None = 0
+    unsafe_labels: int | None = 0
+    neither_labels: int | None = 0
     states: int = 0
     masks: int = 0
     expert_actions: int = 0
@@ -122,6 +122,7 @@ class SafetyMethod(ABC):
         Config: dataclass of its options.
         space: what is tried where it is tuned, values by option.
         published: values of the paper by option, where the defaults are others; the second trial has them.
+        idle: options that do nothing on a system, which trials do not draw.
 
     Source: none.
 
@@ -168,6 +169,11 @@ class SafetyMethod(ABC):
         found, state = self.stages[key]
         torch.set_rng_state(state)
         return found
+
+    @classmethod
+    def idle(cls, env: SafetyEnv) -> tuple[str, ...]:
+        """Options that do nothing on this system."""
+        return ()
 
     @abstractmethod
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:

@@ -35,7 +35,7 @@ from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
 ROW_FILE, CLAIMS_FILE, TRIALS_FILE = "row.json", "claims.npz", "trials.json"
 STAYS = "rows and trials that are done stay; the same command goes on from there"
-SCHEMA = 2  # one more where recordings, encoders or measures have changed: what was measured before is not taken
+SCHEMA = 3  # one more where recordings, encoders or measures have changed: what was measured before is not taken
 _OWN = ("env", "budget", "seed", "out_dir", "trials")
 
 
@@ -240,9 +240,10 @@ def _tuned(cell: Cell) -> tuple[Sequence[str], list[dict[str, Any]]]:
     asked = {
         "method": cell.method, "env": cell.env, "budget": cell.budget, "options": list(cell.options), "trials": cell.trials, "horizon": horizon,
     } | ({"system": system} if (system := hash_of(cell.env)) else {})  # fmt: skip
-    # An option that names the row is not drawn.
-    options = tuning.draws(cell.method, cell.trials, named=[option.partition("=")[0] for option in cell.options])
     env, stages = replace(cell, seed=tuning.SEED).environment(), dict[tuple[str, ...], Any]()
+    # An option that names the row is not drawn, nor is one that does nothing here.
+    named = [*(option.partition("=")[0] for option in cell.options), *kind_of(cell.method).idle(env)]
+    options = tuning.draws(cell.method, cell.trials, named=named)
 
     def trial(words: Sequence[str]) -> float:
         method = make(cell.method, [*cell.options, *words])

@@ -2,11 +2,11 @@ r"""Latent safety filters: a margin of failure in the latent of a world model, a
 
 Faithful to Nakamura, Peters, Bajcsy, *Generalizing safety beyond collision-avoidance via latent-space reachability analysis*,
 RSS 2025 (arXiv 2502.00935; code CMU-IntentLab/latent-safety): a failure label for every picture, margin hinge of 0.75, tanh, the
-discounted safety Bellman backup with the discount annealed, a filter that switches to the best action where Q falls below a
+discounted safety Bellman backup, a filter that switches to the best action where Q falls below a
 threshold. Stand-ins: this library's encoder and deterministic latent dynamics (SaLaD, trained with the failure labels alone) in
 place of a recurrent world model of 27 million weights; 21 actions with one Q each, all of them backed up in imagination, in place of
-DDPG; 5 x 10^3 updates in place of 6 x 10^5. Published are a discount that ends at 0.9999, tau of 0.005, a batch of 512 and a Q of three
-layers (``published``): on the cars that finds more than the defaults do.
+DDPG; 5 x 10^3 updates in place of 6 x 10^5. Published are a discount of 0 in the first of 15 parts of the updates and of 0.9999 in the others, tau of 0.005,
+a batch of 512 and a Q of three layers of 128 (``published``). The defaults are this library's, with a discount that rises from 0 to its value.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ class LatentSafeConfig:
     world_steps: int = 2000  # of the optimiser on pictures
     margin_steps: int = 2000  # on the margin
     steps: int = 5000  # on Q
-    discount: float = 0.995  # at the end; its distance from 1 falls geometrically from 1
+    discount: float = 0.995  # at the end; its distance from 1 falls geometrically from 1 unless there is a warm-up
+    warmup: float = 0.0  # share of the updates with a discount of 0, before the whole discount; 0: annealed
     tau: float = 0.02  # step of the delayed Q
     actions: int = 21
     threshold: float = 0.0  # eps of the filter
@@ -61,13 +62,15 @@ class LatentSafe(SafetyMethod):
     space: ClassVar[dict[str, tuple[Any, ...]]] = {
         "world_steps": (2000, 6000), "discount": (0.98, 0.995, 0.999), "threshold": (0.0, 0.1, 0.2, 0.3), "actions": (21, 41),
     }  # fmt: skip
-    published: ClassVar[dict[str, Any]] = {"discount": 0.9999, "tau": 0.005, "batch": 512, "layers": 3}
+    published: ClassVar[dict[str, Any]] = {"discount": 0.9999, "tau": 0.005, "batch": 512, "layers": 3, "warmup": 0.07}
 
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """World model, margin, value, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
         if not 0.0 <= c.discount < 1.0:
             raise ConfigError(f"{self.name}: expected discount in [0, 1), received {c.discount}")
+        if not 0.0 <= c.warmup < 1.0:
+            raise ConfigError(f"{self.name}: expected warmup in [0, 1), received {c.warmup}")
         if env.action_dim != 1:
             raise ConfigError(f"{self.name}: expected a system of one action, received {type(env).__name__} with {env.action_dim}; take a method of another kind")
         self.env = env
@@ -125,7 +128,8 @@ class LatentSafe(SafetyMethod):
         def loss(rows: Tensor) -> dict[str, Tensor]:
             share = done[0] / max(1, c.steps)
             done[0] += 1
-            gamma = 1.0 - (1.0 - c.discount) ** min(1.0, share / 0.8) if c.steps > 1 else c.discount
+            annealed = 1.0 - (1.0 - c.discount) ** min(1.0, share / 0.8) if c.steps > 1 else c.discount
+            gamma = c.discount * (share >= c.warmup) if c.warmup else annealed
             at = z[rows]
             with torch.no_grad():
                 for slow, fast in zip(delayed.parameters(), self.value.parameters(), strict=True):
@@ -149,12 +153,16 @@ class LatentSafe(SafetyMethod):
         value = self._q(seen).amax(1) - self.config.threshold
         return torch.where(value > 0, -value, (-value).clamp_min(1e-9))
 
+    def value_of(self, q: Tensor, action: Tensor) -> Tensor:
+        """Of values ``(n, k)`` that of the tried action nearest to each of ``(n, 1)``."""
+        share = (action[:, 0] / self.env.max_action).clamp(-1, 1)
+        index = ((share + 1) / 2 * (len(self.tried) - 1)).round().long()
+        return q[torch.arange(len(q)), index]
+
     def act(self, seen: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor]:
         """The wanted action where its value is above the threshold, else the best one."""
         q = self._q(seen)
-        share = (nominal[:, 0] / self.env.max_action).clamp(-1, 1)
-        index = ((share + 1) / 2 * (len(self.tried) - 1)).round().long()
-        kept = q[torch.arange(len(q)), index] > self.config.threshold
+        kept = self.value_of(q, nominal) > self.config.threshold
         action = torch.where(kept[:, None], nominal, self.tried[q.argmax(1)][:, None])
         return action, q.amax(1) <= self.config.threshold
 

@@ -360,7 +360,7 @@ def calibrated_level(barrier: Tensor, entered: Tensor, share: float = _ENTER) ->
     if not len(good):
         return -math.inf
     last = int(good[-1])
-    return 0.0 if last == len(order) - 1 else float(barrier[order[last]])
+    return 0.0 if last == len(order) - 1 else min(0.0, float(barrier[order[last]]))  # fresh noise at a start may say more than zero
 
 
 def _latency(it: _Score) -> None:

@@ -2,7 +2,7 @@ r"""CMU's LatentCBF: a latent safety filter whose margin has a bounded slope, an
 
 Faithful to Nakamura et al., *How to train your latent control barrier function*, L4DC 2026 (arXiv 2511.18606; code
 CMU-IntentLab/latent_cbf): the Wasserstein-like margin with a gradient penalty on segments between safe and failed latents, and
-the filter that keeps the actions of at least nine tenths of the best value and takes the nearest of 25. Stand-ins: those of
+the filter that keeps the actions of at least nine tenths of the best value and takes the nearest of 25 and the wanted one. Stand-ins: those of
 :mod:`~torchrl_sspl.baselines.latent_safe`, on which it builds; and random data throughout, where the paper replays half of a
 nominal and half of a safety policy.
 """
@@ -58,12 +58,13 @@ class SmoothLatent(LatentSafe):
         }
 
     def act(self, seen: Tensor, nominal: Tensor) -> tuple[Tensor, Tensor]:
-        """The nearest of the actions that keep the share of the best value; where that is not positive, the best one."""
+        """The wanted action or the nearest that keeps the share of the best value; where that is not positive, the best one."""
         q = self._q(seen)
         best = q.amax(1)
         bound = torch.where(best > 0, self.config.keep * best, best)
-        tried = self.tried[None, :, None].expand(len(q), -1, 1)
-        action, _ = nearest_admissible(tried, -q, -bound, nominal)
+        tried = torch.cat([nominal[:, None], self.tried[None, :, None].expand(len(q), -1, 1)], 1)
+        # The wanted action counts as the one of the grid that is nearest to it.
+        action, _ = nearest_admissible(tried, -torch.cat([self.value_of(q, nominal)[:, None], q], 1), -bound, nominal)
         return action, best <= self.config.threshold
 
 

@@ -32,6 +32,7 @@ from torchrl_sspl.runtime.filter import LEVEL, UNPROVED_MARGIN, Shield
 from torchrl_sspl.trainers.phases import Check
 
 CPU_FILE = "cpu.json"  # of a training: s of the processor
+BUDGET_FILE = "budget.json"  # of a training: what was counted of its data
 # The score's pictures have no noise to be steady under, and an error of one step adds up in a memory alone.
 _PLAIN = ["augmentation.share=0.0", "synthesis.steady_steps=0", "synthesis.dynamics_steps=1500", "synthesis.unsafe_margin=0.05"]
 # One round has no second one that mends it: its checks may move the set farther in, as with few labels.
@@ -90,8 +91,8 @@ def recorded_first(usual: Config, frames: int) -> list[str]:
     return [f"trainer.total_frames={frames}", f"collector.init_random_frames={frames}", f"trainer.optim_steps_per_batch={steps}"]
 
 
-def needs_of(counted: Mapping[str, int]) -> Needs:
-    """What a training was given, from the counts that it keeps of its data.
+def needs_of(counted: Mapping[str, int] | None) -> Needs:
+    """What a training was given, from the counts that it keeps of its data; None: it kept none.
 
     Source: none.
 
@@ -99,6 +100,8 @@ def needs_of(counted: Mapping[str, int]) -> Needs:
         >>> needs_of({"transitions": 640, "labels of S": 100, "chosen labels of S": 7, "chosen labels of neither": 20}).safe_labels
         107
     """
+    if counted is None:
+        return Needs(None, None, None, None, rollouts=None, held_out_labels=None, held_out_steps=None)
     labels = {name: sum(counted.get(f"{how} of {name}", 0) for how in ("labels", "chosen labels")) for name in ("S", "U", "neither")}
     return Needs(
         transitions=counted.get("transitions", 0), safe_labels=labels["S"], unsafe_labels=labels["U"], neither_labels=labels["neither"],
@@ -149,10 +152,13 @@ class SSPL(SafetyMethod):
             shield = Shield(self.agent, level=self.config.level, margin=margin)
         self.shield = shield
 
-    def _told(self) -> dict[str, int]:
-        """What an agent that was trained before says of its data."""
-        found = agent_directory(self.config.agent) / "evaluation.json"
-        return json.loads(found.read_text()).get("budget", {}) if found.is_file() else {}
+    def _told(self) -> dict[str, int] | None:
+        """What an agent that was trained before says of its data; None if it says nothing."""
+        folder = agent_directory(self.config.agent)
+        if (folder.parent / BUDGET_FILE).is_file():  # of a row of the table
+            return json.loads((folder.parent / BUDGET_FILE).read_text())
+        found = folder / "evaluation.json"
+        return json.loads(found.read_text()).get("budget") if found.is_file() else None
 
     def _train(self, env: SafetyEnv, budget: Budget, seed: int) -> tuple[Agent, dict[str, int]]:
         if self.directory is None or not self.env_name:
@@ -167,7 +173,9 @@ class SSPL(SafetyMethod):
         self.checks = experiment.work.checks
         self.notes["passed"] = float(any(check.passed for check in self.checks))
         experiment.work.source.count_stored()  # of a training without phases nothing is counted before
-        return agent, dict(experiment.work.source.budget)
+        counted = dict(experiment.work.source.budget)
+        write(experiment.directory / BUDGET_FILE, json.dumps(counted, indent=1) + "\n")
+        return agent, counted
 
     @contextmanager
     def _timed(self, path: Path) -> Iterator[None]:

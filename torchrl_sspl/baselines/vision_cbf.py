@@ -149,6 +149,11 @@ class VisionCBF(OneStepFilter):
         "steps": (1500, 4500), "k": (0.5, 1.0, 2.0), "alpha": (0.5, 0.8, 0.95), "offset": (0.0, 0.1, 0.3),
     }  # fmt: skip
 
+    @classmethod
+    def idle(cls, env: SafetyEnv) -> tuple[str, ...]:
+        """The car's barrier has no ``k``."""
+        return () if isinstance(env, PixelPendulumEnv) else ("k",)
+
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Learn to draw the geometry; see :meth:`SafetyMethod.fit`."""
         c = self.config
