@@ -191,6 +191,7 @@ def test_a_calibrated_level_never_rises_and_may_leave_nothing():
     value = torch.linspace(-1, 0, 1001)
     assert calibrated_level(value, torch.zeros(1001, dtype=torch.bool)) == 0.0
     assert calibrated_level(value, value > -0.5) == pytest.approx(-0.5, abs=0.01)
+    assert calibrated_level(torch.tensor([-0.1, 0.05, 0.06]), torch.tensor([False, False, True])) == 0.0  # noise at a start
     assert calibrated_level(value, torch.ones(1001, dtype=torch.bool)) == -math.inf
 
 

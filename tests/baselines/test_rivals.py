@@ -17,10 +17,10 @@ from torchrl_sspl.baselines.imitation import KernelExpert
 from torchrl_sspl.baselines.latent_cbf import BoundedAutoencoder, ControlAffine
 from torchrl_sspl.baselines.nerf_cbf import NeRFCBF, Scene
 from torchrl_sspl.baselines.neural_cbf import QuadraticBarrier
-from torchrl_sspl.baselines.perception import Coordinates, Perception, encoder_for, perception_error
+from torchrl_sspl.baselines.perception import Coordinates, Perception, encoder_for, fresh_error, perception_error
 from torchrl_sspl.baselines.registry import kind_of
 from torchrl_sspl.baselines.scoring import adversarial, harmless, nominals, well_inside
-from torchrl_sspl.baselines.sspl import settings
+from torchrl_sspl.baselines.sspl import BUDGET_FILE, settings
 from torchrl_sspl.baselines.vision_cbf import Geometry
 from torchrl_sspl.configs import compose, reader
 from torchrl_sspl.data import collect_random
@@ -29,6 +29,7 @@ from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.evaluation.measurements import Evaluation
 from torchrl_sspl.experiments import Experiment
+from torchrl_sspl.modules.agent import load
 from torchrl_sspl.viability import viability_kernel
 
 TINY = {
@@ -149,6 +150,16 @@ def test_the_shipped_agent_is_a_row_with_its_memory(systems):
     simulate(acts, env, start=torch.tensor([[0.0, 0.0], [1.5, 1.5]]), horizon=5)
     assert acts.infeasible == 5  # no action keeps a set that has been left, in one of two episodes
     assert method.needs.held_out_labels is None  # its training did not count them
+
+
+def test_what_an_agent_does_not_say_of_its_data_is_not_counted(systems, tmp_path):
+    load("pendulum").save(tmp_path / "run" / "agent")
+    method = make("sspl", [f"agent={tmp_path / 'run' / 'agent'}"])
+    method.fit(None, systems["pendulum"][0], BUDGETS["tiny"], 0)
+    assert method.needs.transitions is method.needs.safe_labels is method.needs.held_out_steps is None
+    (tmp_path / "run" / BUDGET_FILE).write_text('{"transitions": 640, "labels of S": 7}')  # of a row of the table
+    method.fit(None, systems["pendulum"][0], BUDGETS["tiny"], 0)
+    assert (method.needs.transitions, method.needs.safe_labels, method.needs.unsafe_labels) == (640, 7, 0)
 
 
 def test_a_training_needs_a_directory(systems):
@@ -308,8 +319,45 @@ def test_the_state_is_learnt_from_pictures(systems):
     env = PendulumEnv([16])
     data = record(env, Budget("try", 400, 0, 0), 1)
     torch.manual_seed(0)
-    few, more = (perception_error(Perception(env, data, n, 0)(data.pixels), data.state, env)["x0_q50"] for n in (2, 60))
-    assert more < 0.5 * few
+    few, more = (Perception(env, data, n, 0) for n in (2, 60))
+    told = [perception_error(eyes.at.state(eyes.encoder(data.pixels).detach()), data.state, env)["x0_q50"] for eyes in (few, more)]
+    assert told[1] < 0.5 * told[0]
+
+
+def test_what_the_features_say_linearly_is_read_out_whatever_the_encoder_has_learnt():
+    env = DubinsEnv([16])
+    eyes = Perception(env, record(env, Budget("try", 300, 0, 0), 1), 1, 0)
+    found = fresh_error(eyes, env, n=200)
+    assert max(found["x0_q50"], found["x1_q50"]) < 0.01  # m; the encoder alone is out by half a metre
+    assert found["x2_q50"] < 0.1
+
+
+def test_the_wanted_action_is_kept_where_its_value_is_admitted(systems):
+    env = systems["pendulum"][0]
+    method = make("smooth_latent")
+    method.env, method.tried = env, torch.linspace(-env.max_action, env.max_action, 25)
+    wanted = torch.tensor([[0.07], [-1.23]])
+    for value, kept in ((0.95, True), (0.85, False)):  # of the wanted actions; of the best one 1
+        q = torch.full((2, 25), value)
+        q[:, 0] = 1.0
+        method._q = lambda seen, q=q: q
+        action, lost = method.act(torch.zeros(2), wanted)
+        assert bool((action == wanted).all()) is kept
+        assert not lost.any()
+
+
+def test_a_discount_has_a_warm_up_or_is_annealed(systems):
+    env, _, data = systems["pendulum"]
+    with pytest.raises(ConfigError, match=r"latent_safe: expected warmup in \[0, 1\), received 1\.0"):
+        make("latent_safe", ["warmup=1.0"]).fit(data, env, BUDGETS["tiny"], 0)
+    values = {}
+    for words in (["warmup=0.99"], ["discount=0.0"], []):
+        torch.manual_seed(0)
+        method = make("latent_safe", [*TINY["latent_safe"], *words])
+        method.fit(data, env, BUDGETS["tiny"], 0)
+        values[tuple(words)] = method.barrier(data.pixels)
+    assert torch.equal(values["warmup=0.99",], values["discount=0.0",])  # for all of six updates
+    assert not torch.equal(values["warmup=0.99",], values[()])
 
 
 def test_the_field_finds_the_obstacle():

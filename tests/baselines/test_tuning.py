@@ -29,9 +29,15 @@ def test_every_method_that_learns_has_as_many_valid_trials(name):
 
 
 def test_the_second_trial_has_the_published_options_where_the_defaults_are_others():
-    assert draws("latent_safe", 8)[1] == ("discount=0.9999", "tau=0.005", "batch=512", "layers=3")
-    assert draws("smooth_latent", 2, named=["tau", "batch", "layers"])[1] == ("discount=0.9999",)
+    assert draws("latent_safe", 8)[1] == ("discount=0.9999", "tau=0.005", "batch=512", "layers=3", "warmup=0.07")
+    assert draws("smooth_latent", 2, named=["tau", "batch", "layers", "warmup"])[1] == ("discount=0.9999",)
     assert draws("neural_cbf", 2)[1] != ()
+
+
+def test_what_does_nothing_on_a_system_is_not_drawn(tmp_path):
+    assert kind_of("vision_cbf").idle(PendulumEnv()) == ()
+    row = run_cell(Cell.of("vision_cbf", ["env=dubins", "trials=4", f"out_dir={tmp_path}", "steps=1", "batch=4", *SMALL]))
+    assert not any(word.startswith("k=") for trial in row["tuning"]["trials"] for word in trial["options"])
 
 
 def test_a_claim_that_is_not_kept_is_worth_less_than_none():

@@ -7,6 +7,7 @@ CELL, TABLE, SCORING = (f"torchrl_sspl/baselines/{name}.py" for name in ("cell",
 LATENT, VISION = "torchrl_sspl/baselines/latent_cbf.py", "torchrl_sspl/baselines/vision_cbf.py"
 
 PERCEPTION, NERF, PAGE = (f"torchrl_sspl/baselines/{name}.py" for name in ("perception", "nerf_cbf", "page"))
+SMOOTH, SAFE = "torchrl_sspl/baselines/smooth_latent.py", "torchrl_sspl/baselines/latent_safe.py"
 CHOSEN = "tests/trainers/test_phases.py::test_a_policy_that_chooses_is_checked_at_the_level_at_which_it_runs"
 JUDGED = "tests/trainers/test_selection.py"
 SELECTION, AGENT = "torchrl_sspl/trainers/selection.py", "torchrl_sspl/modules/agent.py"
@@ -40,6 +41,14 @@ MUTANTS = [
     (TABLE, "if more := first.get", "if False and first.get", SHOWN),
     (PERCEPTION, "if isinstance(env, CMUDubinsEnv):", "if False:", f"{LEARNT}::test_the_encoder_of_a_car_of_one_colour_tells_its_heading"),
     (PERCEPTION, "ShapeEncoder(max(size, 4), pool_to=side) if whole else ", "", f"{LEARNT}::test_the_encoder_of_a_car_of_one_colour_tells_its_heading"),
+    (PERCEPTION, "seen.flatten(1), torch.ones", "torch.ones", f"{LEARNT}::test_what_the_features_say_linearly_is_read_out_whatever_the_encoder_has_learnt"),
+    (SMOOTH, "torch.cat([nominal[:, None], self.tried", "torch.cat([self.tried[None, :1, None].expand(len(q), -1, 1), self.tried", f"{LEARNT}::test_the_wanted_action_is_kept_where_its_value_is_admitted"),
+    (SMOOTH, "self.value_of(q, nominal)[:, None]", "q[:, :1]", f"{LEARNT}::test_the_wanted_action_is_kept_where_its_value_is_admitted"),
+    (SAFE, "c.discount * (share >= c.warmup) if c.warmup", "c.discount if c.warmup", f"{LEARNT}::test_a_discount_has_a_warm_up_or_is_annealed"),
+    (VISION, '() if isinstance(env, PixelPendulumEnv) else ("k",)', "()", f"{TRIED}::test_what_does_nothing_on_a_system_is_not_drawn"),
+    (SCORING, "else min(0.0, float(barrier[order[last]]))", "else float(barrier[order[last]])", "tests/baselines/test_ceilings.py"),
+    (OWN, "if (folder.parent / BUDGET_FILE).is_file():", "if False:", f"{LEARNT}::test_what_an_agent_does_not_say_of_its_data_is_not_counted"),
+    (OWN, "    if counted is None:\n", "    counted = counted or {}\n    if False:\n", f"{LEARNT}::test_what_an_agent_does_not_say_of_its_data_is_not_counted"),
     (NERF, "self.view = env.half_view", "self.view = 1.2 * env.arena_half_size", LEARNT),
     (VISION, "        view = self.env.half_view\n", "        view = 1.2 * self.env.arena_half_size\n", LEARNT),
     (PAGE, "Path(env).stem", "env", f"{SHOWN}::test_a_page_has_systems_of_more_coordinates_and_systems_of_a_file"),
