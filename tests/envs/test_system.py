@@ -10,7 +10,7 @@ import torch
 
 from torchrl_sspl.envs import CMUTwoDiscsEnv, DubinsEnv, GymnasiumRenderer, PendulumEnv, Requirement, System
 from torchrl_sspl.envs.dubins import YAW_LAG
-from torchrl_sspl.errors import MissingDependencyError
+from torchrl_sspl.errors import ConfigError, MissingDependencyError
 
 
 def measured(**values):
@@ -25,6 +25,11 @@ def measured(**values):
 def test_verdicts(value, sense, verdict):
     must, aim = (0.4, 0.2) if sense == "<=" else (0.2, 0.4)
     assert Requirement("x", "share", sense, must, aim).verdict(measured(x=value)) == verdict
+
+
+def test_a_direction_that_is_not_in_the_plane_is_refused():
+    with pytest.raises(ConfigError, match=r"System 'Puck': expected action_direction of two numbers.* received \(0\.0, 0\.0, 1\.0, 1\.0\)"):
+        System("Puck", ("x", "y", "vx", "vy"), "force", action_direction=(0.0, 0.0, 1.0, 1.0))
 
 
 def test_a_requirement_of_which_nothing_was_said_is_not_measured():

@@ -390,6 +390,38 @@ def test_networks_of_ones_own_are_found_by_their_import_path(own_module, tmp_pat
         Agent.load(tmp_path / "agent")
 
 
+class Scaled(nn.Module):
+    def __init__(self, latent_dim, scale=1.0):
+        super().__init__()
+        self.scale, self.net = scale, nn.Linear(latent_dim, 1)
+
+    def forward(self, latent):
+        return self.scale * self.net(latent)
+
+
+class Bare(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.net = nn.Linear(2, 1)
+
+    def forward(self, latent):
+        return self.net(latent)
+
+
+def test_a_network_of_ones_own_that_would_be_read_as_another_is_not_saved(tmp_path):
+    with pytest.raises(ConfigError, match=r"policy: .* whose scale is 10\.0 and would be 1\.0; set self\.arguments = .* in Scaled\.__init__"):
+        Agent.from_networks(*networks()[:3], policy := Scaled(2, 10.0)).save(tmp_path)
+    with pytest.raises(ConfigError, match=r"policy: expected a network that can be built again .*latent_dim.*; set self\.arguments"):
+        Agent.from_networks(*networks()[:3], Bare()).save(tmp_path)
+    with pytest.raises(ConfigError, match=r"policy: .* whose scale"):  # within one of the library's
+        Agent.from_networks(*networks()[:3], Scaled(2, 10.0), choices=[[0.0], [1.0]]).save(tmp_path)
+    assert not list(tmp_path.iterdir())
+    policy.arguments = {"latent_dim": 2, "scale": 10.0}
+    agent = Agent.from_networks(*networks()[:3], policy)
+    again = Agent.load(agent.save(tmp_path))
+    assert torch.equal(agent.policy(torch.ones(2)), again.policy(torch.ones(2)))
+
+
 def test_an_agent_written_by_a_program_names_the_programs_file(own_module, tmp_path):
     runpy.run_path(f"{own_module}.py", run_name="__main__")
     agent = Agent.load(tmp_path / "agent")

@@ -87,6 +87,7 @@ def test_the_file_says_what_it_is(onnx_file):
         ({"config": {"env": {"_target_": "my_system:Cart"}}}, None),
         ({"config": {"env": {"made by": "my.make", "dt": "half"}}}, None),
         ({"config": 3}, None),
+        ({"dt": 0.1, "config": {"env": {"_target_": "my_system:Cart"}}}, 0.1),  # as a run of a system in code says it
         ({}, None),
     ],
 )

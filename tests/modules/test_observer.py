@@ -14,7 +14,7 @@ from torchrl.envs import TransformedEnv
 from torchrl.modules.utils import get_env_transforms_from_module
 
 from torchrl_sspl.envs import PendulumEnv
-from torchrl_sspl.errors import CheckpointError, ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, NonFiniteError, ShapeError
 from torchrl_sspl.evaluation.controllers import AgentController
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.modules import BearingEncoder, FrameEncoder, LatentDynamics, LatentObserver, Policy, Predict
@@ -239,6 +239,14 @@ def test_resets_forget_some_or_all():
     assert not torch.allclose(again.latent[[0, 2]], first.latent[[0, 2]], atol=1e-6)
     controller.reset()
     assert torch.equal(controller.step(frames(4)).latent, first.latent)
+
+
+def test_what_is_no_tensor_and_no_row_is_refused():
+    controller = small_agent().controller(4)
+    with pytest.raises(DTypeError, match=r"pixels as a tensor .*received ndarray; torch\.as_tensor"):
+        controller.step(frames(4).numpy())
+    with pytest.raises(ShapeError, match=r"expected rows of 4 systems.* received \[7\]"):
+        controller.reset([7])
 
 
 def test_wrong_batches_are_refused():

@@ -398,6 +398,8 @@ def test_inverse_dynamics_of_unknown_sizes_must_be_given() -> None:
             r"\(5, 1\), received \(5,\)",
         ),
         (lambda data: data.set("action", data["action"].squeeze(-1)), ShapeError, r"action_dim.*\(5,\)"),
+        (lambda data: data.set("action", data["action"].double()), DTypeError, r"'action' .* torch\.float32, received torch\.float64; .*DoubleToFloat"),
+        (lambda data: data.set("action", data["action"].long()), DTypeError, r"received torch\.int64"),
     ],
 )
 def test_wrong_batches_are_told_what_was_expected(labelled: TensorDict, change, error, message: str) -> None:

@@ -243,6 +243,12 @@ def test_behind_a_policy_that_pushes_the_pendulum_stays_out_of_u():
     assert torch.equal(changed, kept["intervened"])
 
 
+def test_what_an_environment_would_give_is_named_where_it_is_missing():
+    protect, pixels = SafetyFilter(load("pendulum")), torch.zeros(3, 6, 64, 64, dtype=torch.uint8)
+    with pytest.raises(ConfigError, match=r"expected \['prior'.*make_tensordict_primer\(\).*Monitor and Shield"):
+        protect(TensorDict({"pixels": pixels, "action": torch.zeros(3, 1)}, [3]))
+
+
 class Gym(gymnasium.Env):
     """The pendulum as an environment of gymnasium, its two frames in one of three layouts."""
 

@@ -357,6 +357,8 @@ class Config:
             if found not in choices:
                 raise ConfigError(f"expected {key} to be one of {', '.join(choices)}, received '{found}'")
         c = self.collector
+        if self.trainer.total_frames < 1:
+            raise ConfigError(f"expected trainer.total_frames >= 1, received {self.trainer.total_frames}")
         if c.backend == "sync" and c.workers != 1:
             raise ConfigError(
                 f"expected collector.workers=1 with collector.backend=sync, received {c.workers}; "

@@ -9,6 +9,8 @@ from typing import Any
 
 from torch import Tensor
 
+from torchrl_sspl.errors import ConfigError
+
 
 @dataclass(frozen=True)
 class Requirement:
@@ -101,7 +103,7 @@ class System:
         unsafe_grid: the same of a grid of its own over U, a periodic coordinate without its last node; None: the nodes
             of ``state_grid`` in U.
         action_direction: direction of a positive action in the plane of the first two coordinates (a torque pushes the
-            angular velocity: ``(0, 1)``), for figures; None: along the path.
+            angular velocity: ``(0, 1)``), for figures, two numbers or a ConfigError; None: along the path.
         notes: what a report has to say about this system.
         openings: scenes of its film.
 
@@ -122,3 +124,10 @@ class System:
     action_direction: tuple[float, float] | None = None
     notes: tuple[str, ...] = ()
     openings: tuple[Opening, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.action_direction is not None and len(self.action_direction) != 2:
+            raise ConfigError(
+                f"System {self.title!r}: expected action_direction of two numbers, in the plane of the first two coordinates, received {self.action_direction}; "
+                "give None where an action does not move that plane along one direction"
+            )

@@ -220,6 +220,8 @@ class Experiment:
         body = self.config.to_dict()
         body.pop("out_dir")
         description = {"config": body, "seeds": self.seeds(), "environment": describe(self.make_env)}
+        if isinstance(period := getattr(self.env, "dt", None), int | float):
+            description["dt"] = float(period)
         nets = self.encoder, self.dynamics, self.barrier, self.policy
         work = Workspace(
             *nets, config=self.config.synthesis, source=source, seed=seed, out_dir=self.directory, description=description

@@ -246,7 +246,7 @@ class Agent(nn.Module):
 
         Raises:
             ConfigError: if the agent has no description of its networks, or its barrier is none of linear layers and ReLU, as which it would
-                be read.
+                be read, or a network of your own would be another one when it is built again.
             OutputError: if it cannot be written.
         """
         if "networks" not in self.description:
@@ -260,6 +260,8 @@ class Agent(nn.Module):
                 f"expected a barrier like {read}, as which its description would be read, received {self.barrier}; what is proved of one says "
                 "nothing of the other: train it with ReLU, or keep the agent in your own code"
             )
+        for role in ("encoder", "dynamics", "policy"):
+            _built_again(role, getattr(self, role), self.latent_dim)
         path = Path(path)
         write(path / WEIGHTS_FILE, as_bytes({k: v.contiguous() for k, v in self.state_dict().items()}))
         body = {"format": FORMAT_VERSION, "lipschitz_bound": self.lipschitz_bound, **self.description}
@@ -369,12 +371,12 @@ def build_encoder(name: str, **sizes: Any) -> nn.Module:
     return call_with(kind, sizes)
 
 
-def call_with(kind: Any, sizes: dict[str, Any]) -> nn.Module:
-    """A class or function called with those of the sizes that it takes; a ConfigError if it needs something else."""
+def call_with(kind: Any, sizes: dict[str, Any], role: str = "encoder") -> nn.Module:
+    """A class or function called with those of the sizes that it takes; a ConfigError, which names the role, if it needs something else."""
     if isinstance(kind, nn.Module) or not callable(kind):
         found = "a module; give its class," if isinstance(kind, nn.Module) else "a"
         raise ConfigError(
-            f"encoder: expected a class or a function latent_dim -> module, received {found} {type(kind).__name__}"
+            f"{role}: expected a class or a function latent_dim -> module, received {found} {type(kind).__name__}"
         )
     taken = inspect.signature(kind).parameters
     if any(p.kind is p.VAR_KEYWORD for p in taken.values()) and "latent_dim" in taken:
@@ -387,7 +389,7 @@ def call_with(kind: Any, sizes: dict[str, Any]) -> nn.Module:
         made = kind(**chosen) if chosen else kind(sizes["latent_dim"])
     except TypeError as error:
         raise ConfigError(
-            f"encoder: expected a class or a function latent_dim -> module, received one that raises TypeError: {error}"
+            f"{role}: expected a class or a function latent_dim -> module, received one that raises TypeError: {error}"
         ) from error
     if not getattr(made, "arguments", None):
         made.arguments = chosen or {"latent_dim": sizes["latent_dim"]}  # with which it is built again
@@ -400,9 +402,42 @@ def _describe(network: nn.Module, latent_dim: int) -> dict[str, Any]:
     own, module = {**ENCODERS, **DYNAMICS, **POLICIES}.get(kind.__name__) is not kind, kind.__module__
     if module == "__main__":  # of a program: others find the class in its file
         module = Path(getattr(sys.modules[module], "__file__", None) or module).stem
-    arguments = getattr(network, "arguments", None) or {"latent_dim": latent_dim}
+    arguments = _arguments(network, latent_dim)
     arguments = {k: _describe(v, latent_dim) if isinstance(v, nn.Module) else v for k, v in arguments.items()}
     return {"class": f"{module}:{kind.__qualname__}" if own else kind.__name__, "arguments": arguments}
+
+
+def _arguments(network: nn.Module, latent_dim: int) -> dict[str, Any]:
+    """With what a network is built again."""
+    return getattr(network, "arguments", None) or {"latent_dim": latent_dim}
+
+
+def _built_again(role: str, network: nn.Module, latent_dim: int) -> None:
+    """A ConfigError if a network of your own, built from its arguments, would not be the same one."""
+    arguments = _arguments(network, latent_dim)
+    for value in arguments.values():
+        if isinstance(value, nn.Module):
+            _built_again(role, value, latent_dim)
+    if type(network) in {**ENCODERS, **DYNAMICS, **POLICIES}.values():
+        return
+    how = f"set self.arguments = {{...}} in {type(network).__name__}.__init__, by name all that it was called with"
+    try:
+        with torch.random.fork_rng(devices=[]):  # saving draws no random numbers
+            again = call_with(type(network), copy.deepcopy(arguments), role)
+        again.load_state_dict(network.state_dict())
+    except (ConfigError, RuntimeError) as error:
+        raise ConfigError(f"{role}: expected a network that can be built again from {arguments}, received one that cannot: {error}; {how}") from error
+    for (name, mine), theirs in zip(network.named_modules(), again.modules(), strict=False):
+        for key, value in _settings(mine).items():
+            if value != (found := _settings(theirs).get(key)):
+                where = f"{name}.{key}" if name else key
+                raise ConfigError(f"{role}: expected a network that is the same when it is built again from {arguments}, received one whose {where} is {value} and would be {found}; {how}")
+
+
+def _settings(module: nn.Module) -> dict[str, Any]:
+    """What a module holds beside weights: plain values, and tensors as lists."""
+    held = {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(module).items() if k not in ("training", "arguments") and not k.startswith("_")}
+    return {k: v for k, v in held.items() if isinstance(v, bool | int | float | str | tuple | list | dict)}
 
 
 def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bool) -> nn.Module:
@@ -424,7 +459,7 @@ def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bo
         kind = resolve(name)
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             raise CheckpointError(f"expected a class of networks (nn.Module), received '{name}', which is none")
-        return call_with(kind, arguments)
+        return call_with(kind, arguments, next(role for known, role in ((ENCODERS, "encoder"), (DYNAMICS, "dynamics"), (POLICIES, "policy")) if known is registry))
     except ConfigError as error:
         raise CheckpointError(f"the network '{name}' cannot be built: {error}") from error
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchrl_sspl.devices import compiled
 from torchrl_sspl.direction import direction_of, within
-from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
 from torchrl_sspl.modules.observer import completed, corrected, held
 
 
@@ -179,7 +179,10 @@ class Controller:
 
     def reset(self, rows: Tensor | None = None) -> None:
         """Begin new episodes: all n, or those of some rows (indices or a mask)."""
-        index = None if rows is None else torch.arange(self.batch_size, device=self._applies.device)[rows]
+        try:
+            index = None if rows is None else torch.arange(self.batch_size, device=self._applies.device)[rows]
+        except IndexError as error:
+            raise ShapeError(f"expected rows of {self.batch_size} systems, as indices or as a mask ({self.batch_size},), received {rows}") from error
         self._memory.forget(index)
         self._applies[slice(None) if index is None else index] = True
         if rows is None:
@@ -196,6 +199,8 @@ class Controller:
         if pixels is None:
             latent, nothing = memory.unseen(n), torch.full((n, self.agent.latent_dim), math.nan, device=self._applies.device)
             return self.remember(*self._judged(latent, nothing, nothing), rows=(~self.begins).nonzero()[:, 0])
+        if not isinstance(pixels, Tensor):
+            raise DTypeError(f"expected pixels as a tensor of dtype torch.uint8, received {type(pixels).__name__}; torch.as_tensor(pixels) makes one of numpy")
         if pixels.ndim != 4 or len(pixels) != n:
             raise ShapeError(f"expected pixels of {n} systems, ({n}, 6, H, W), received {tuple(pixels.shape)}; make a controller for them")
         return self.remember(*self._look(pixels.to(self._applies.device), *self.expected()))

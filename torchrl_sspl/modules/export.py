@@ -135,6 +135,8 @@ def _period(agent: Any) -> float | None:
     """Time between two steps in s; None where the agent's description does not say it, and names no system of this library."""
     from torchrl_sspl import envs
 
+    if isinstance(told := agent.description.get("dt"), int | float):
+        return float(told)
     config = agent.description.get("config")
     named = config.get("env") if isinstance(config, Mapping) else None
     period = named.get("dt") if isinstance(named, Mapping) else None

@@ -474,6 +474,11 @@ class LatentLoss(LossModule):
                     f"expected {keys.action!r} of shape (*{tuple(batch.shape)}, action_dim), received "
                     f"{tuple(batch.action.shape)}; a scalar action keeps its last dimension of size 1"
                 )
+            if not batch.action.is_floating_point() or (batch.action.dtype == torch.float64 and batch.latent.dtype != torch.float64):
+                raise DTypeError(
+                    f"expected {keys.action!r} of a dtype that the networks take, such as {torch.get_default_dtype()}, received {batch.action.dtype}; "
+                    "convert it, for instance with DoubleToFloat in the environment"
+                )
         if "region" in self._needs:
             batch.region = self._get(tensordict, keys.region, "region")
             if batch.region.dtype != torch.int64:
