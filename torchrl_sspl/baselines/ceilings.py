@@ -42,7 +42,7 @@ class Ceiling(OneStepFilter):
     def fit(self, data: Any, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """Nothing is learnt; raises ConfigError if the method does not know such a system."""
         if not isinstance(env, self.system):
-            raise ConfigError(f"{self.name}: expected a {self.system.__name__}, received {type(env).__name__}; see the list of methods")
+            raise ConfigError(f"{self.name}: expected a {self.system.__name__}, received {type(env).__name__}; box_margin and kernel take any system")
         noise = torch.tensor([float(v) for v in self.config.noise] or [0.0] * env.state_dim)
         if len(noise) != env.state_dim or bool((noise < 0).any()) or not 0 <= self.config.alpha < 1 or self.config.actions < 2:
             raise ConfigError(

@@ -11,12 +11,14 @@ from typing import Any
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from torchrl_sspl.errors import ConfigError, DTypeError, EmptyRegionError, NonFiniteError, ShapeError
 from torchrl_sspl.journal import Entry
 from torchrl_sspl.sets import UNSAFE, Box, Difference, Region, Union
 
 Dynamics = Callable[[Tensor, Tensor], Tensor]
+_PATIENCE = 5.0  # s, after which a progress bar appears
 
 
 class Grid:
@@ -246,12 +248,15 @@ def _iterate(
         state = {"value": value, "iterations": iterations, "change": change, "seconds": time.perf_counter() - start}
         entry.save(state, complete=complete)
 
-    while change > tolerance and iterations < limit:
-        new = combine(value, problem.best_successor(value, cut))
-        change = float((new - value).abs().max()) / cut
-        value, iterations = new, iterations + 1
-        if entry.due:
-            save()
+    # Only what takes long shows itself: a fine grid of many coordinates.
+    with tqdm(desc=f"kernel on {value.numel():,} nodes", unit="sweep", initial=iterations, delay=_PATIENCE, leave=False) as bar:
+        while change > tolerance and iterations < limit:
+            new = combine(value, problem.best_successor(value, cut))
+            change = float((new - value).abs().max()) / cut
+            value, iterations = new, iterations + 1
+            bar.update()
+            if entry.due:
+                save()
     save(complete=True)
     grid, seconds = problem.grid, time.perf_counter() - start
     value, margin = value.reshape(grid.shape), problem.margin.reshape(grid.shape)
@@ -343,7 +348,8 @@ class _Problem:
         if errors is not None and (errors.ndim != 2 or errors.shape[1] != nodes.shape[1] or not len(errors)):
             raise ShapeError(f"errors: expected shape (j, {nodes.shape[1]}), received {tuple(errors.shape)}.")
         self.successors = []  # per action, for every error: cell, position in it, outside
-        for action in actions.to(nodes):
+        placed = tqdm(actions.to(nodes), desc=f"successors of {len(nodes):,} nodes", unit="action", delay=_PATIENCE, leave=False)
+        for action in placed:
             after = dynamics(nodes, action.expand(nodes.shape[0], -1))
             if after.shape != nodes.shape:
                 raise ShapeError(f"dynamics: expected shape {tuple(nodes.shape)}, received {tuple(after.shape)}.")
