@@ -59,8 +59,8 @@ MUTANTS = [
     (SELECTION, "max(1, len(run) // _STARTED)", "0", JUDGED),
     (AGENT, "if name not in registry and not trust:", "if False:", "tests/modules/test_agent.py"),
     (AGENT, "if not (isinstance(kind, type) and issubclass(kind, nn.Module)):", "if False:", "tests/modules/test_agent.py"),
-    (AGENT, "            _built_again(role, getattr", "            (role, getattr", "tests/modules/test_agent.py"),
-    (AGENT, "            if value != (found", "            if False and value != (found", "tests/modules/test_agent.py"),
+    (AGENT, "        _read_as_written(self)\n", "", "tests/modules/test_agent.py"),
+    (AGENT, "    if not torch.allclose(one, other, equal_nan=True):", "    if False:", "tests/modules/test_agent.py"),
     (AGENT, "        if isinstance(value, nn.Module):\n            _built", "        if False:\n            _built", "tests/modules/test_agent.py"),
     (AGENT, "                agent.double()", "                pass", "tests/modules/test_agent.py"),
 ]

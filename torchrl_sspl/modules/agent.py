@@ -31,7 +31,7 @@ from torchrl_sspl.modules.moments import (
     MomentEncoder,
     TurnedBearingEncoder,
 )
-from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
+from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, as_pair, mlp
 from torchrl_sspl.modules.observer import gain_matrix
 from torchrl_sspl.modules.shapes import ShapeBearingEncoder, ShapeEncoder, ShapePlaceEncoder
 
@@ -260,8 +260,7 @@ class Agent(nn.Module):
                 f"expected a barrier like {read}, as which its description would be read, received {self.barrier}; what is proved of one says "
                 "nothing of the other: train it with ReLU, or keep the agent in your own code"
             )
-        for role in ("encoder", "dynamics", "policy"):
-            _built_again(role, getattr(self, role), self.latent_dim)
+        _read_as_written(self)
         path = Path(path)
         write(path / WEIGHTS_FILE, as_bytes({k: v.contiguous() for k, v in self.state_dict().items()}))
         body = {"format": FORMAT_VERSION, "lipschitz_bound": self.lipschitz_bound, **self.description}
@@ -412,32 +411,44 @@ def _arguments(network: nn.Module, latent_dim: int) -> dict[str, Any]:
     return getattr(network, "arguments", None) or {"latent_dim": latent_dim}
 
 
-def _built_again(role: str, network: nn.Module, latent_dim: int) -> None:
-    """A ConfigError if a network of your own, built from its arguments, would not be the same one."""
+@torch.no_grad()
+def _read_as_written(agent: Agent) -> None:
+    """A ConfigError if a network of your own would be read back as another one: with other arguments than it was made with."""
+    generator = torch.Generator().manual_seed(0)
+    size = as_pair(getattr(agent.encoder, "image_size", None) or 64, "image_size")
+    pixels = torch.randint(256, (4, 6, *size), dtype=torch.uint8, generator=generator)
+    latent = (torch.rand(4, agent.latent_dim, generator=generator) * 2 - 1).to("cpu", agent.gain.dtype)
+    _built_again("encoder", agent.encoder, (pixels,), agent.latent_dim)
+    _built_again("policy", agent.policy, (latent,), agent.latent_dim)
+    _built_again("dynamics", agent.dynamics, (latent, copy.deepcopy(agent.policy).cpu()(latent)), agent.latent_dim)
+
+
+def _built_again(role: str, network: nn.Module, inputs: tuple[Tensor, ...], latent_dim: int) -> None:
+    """A ConfigError if a network of your own, built from its arguments, would not compute the same; one that does not take the inputs is not asked."""
     arguments = _arguments(network, latent_dim)
     for value in arguments.values():
         if isinstance(value, nn.Module):
-            _built_again(role, value, latent_dim)
+            _built_again(role, value, inputs, latent_dim)
     if type(network) in {**ENCODERS, **DYNAMICS, **POLICIES}.values():
         return
-    how = f"set self.arguments = {{...}} in {type(network).__name__}.__init__, by name all that it was called with"
-    try:
-        with torch.random.fork_rng(devices=[]):  # saving draws no random numbers
-            again = call_with(type(network), copy.deepcopy(arguments), role)
-        again.load_state_dict(network.state_dict())
-    except (ConfigError, RuntimeError) as error:
-        raise ConfigError(f"{role}: expected a network that can be built again from {arguments}, received one that cannot: {error}; {how}") from error
-    for (name, mine), theirs in zip(network.named_modules(), again.modules(), strict=False):
-        for key, value in _settings(mine).items():
-            if value != (found := _settings(theirs).get(key)):
-                where = f"{name}.{key}" if name else key
-                raise ConfigError(f"{role}: expected a network that is the same when it is built again from {arguments}, received one whose {where} is {value} and would be {found}; {how}")
-
-
-def _settings(module: nn.Module) -> dict[str, Any]:
-    """What a module holds beside weights: plain values, and tensors as lists."""
-    held = {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(module).items() if k not in ("training", "arguments") and not k.startswith("_")}
-    return {k: v for k, v in held.items() if isinstance(v, bool | int | float | str | tuple | list | dict)}
+    mine, how = copy.deepcopy(network).cpu().eval(), f"set self.arguments = {{...}} in {type(network).__name__}.__init__, by name all that it was called with"
+    with torch.random.fork_rng(devices=[]), torch.no_grad():  # saving draws no random numbers
+        try:
+            again = call_with(type(network), copy.deepcopy(arguments), role).eval().to(next(mine.parameters(), torch.zeros(())).dtype)
+            again.load_state_dict(mine.state_dict())
+        except (ConfigError, RuntimeError) as error:
+            raise ConfigError(f"{role}: expected a network that can be built again from {arguments}, received one that cannot: {error}; {how}") from error
+        try:
+            found = []
+            for net in (mine, again):
+                torch.manual_seed(0)  # of a network that draws
+                found.append(net(*inputs))
+        except (RuntimeError, TypeError, ValueError):  # pictures of another size, or a part that takes something else
+            return
+    one, other = found
+    if not torch.allclose(one, other, equal_nan=True):
+        off = {k: (v, vars(again).get(k)) for k, v in vars(mine).items() if isinstance(v, int | float | str) and v != vars(again).get(k)}
+        raise ConfigError(f"{role}: expected a network that computes the same when it is built again from {arguments}, received one that does not (it has and would have: {off}); {how}")
 
 
 def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bool) -> nn.Module:

@@ -155,10 +155,11 @@ def _picture(agent: Any) -> tuple[int, int, int]:
 
 def _size(agent: Any, wanted: int | Sequence[int] | None = None) -> tuple[int, int]:
     """Height and width of the pictures: of the encoder, or what is wanted where it takes any."""
-    own = getattr(agent.encoder, "image_size", None)
-    size = as_pair(wanted or own or _SIZE, "image_size")
-    if own is not None and size != tuple(own):
-        raise ConfigError(f"expected image_size={tuple(own)}, the one size that the encoder takes, received {size}; leave it out")
+    told = getattr(agent.encoder, "image_size", None)
+    own = as_pair(told, "image_size") if told else None
+    size = own if wanted is None and own else as_pair(wanted or _SIZE, "image_size")
+    if own and size != own:
+        raise ConfigError(f"expected image_size={own}, the one size that the encoder takes, received {size}; leave it out")
     return size
 
 
