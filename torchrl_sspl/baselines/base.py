@@ -122,7 +122,6 @@ class SafetyMethod(ABC):
         Config: dataclass of its options.
         space: what is tried where it is tuned, values by option.
         published: values of the paper by option, where the defaults are others; the second trial has them.
-        idle: options that do nothing on a system, which trials do not draw.
 
     Source: none.
 
@@ -172,7 +171,7 @@ class SafetyMethod(ABC):
 
     @classmethod
     def idle(cls, env: SafetyEnv) -> tuple[str, ...]:
-        """Options that do nothing on this system."""
+        """Options that do nothing on this system, which trials do not draw."""
         return ()
 
     @abstractmethod

@@ -7,7 +7,7 @@ threshold. Stand-ins: this library's encoder and deterministic latent dynamics (
 place of a recurrent world model of 27 million weights; 21 actions with one Q each, all of them backed up in imagination, in place of
 DDPG; 5 x 10^3 updates in place of 6 x 10^5; and a discount that rises from 0 to its value, where theirs is 0 in the first of 15 parts of the updates and
 0.9999 in the others (``warmup=0.07``). Published are that discount, tau of 0.005, a batch of 512 and a Q of three layers of 128 (``published``): on the cars
-that finds more than the defaults do, with the discount that rises; with so few updates theirs keeps next to nothing.
+that finds more than the defaults do, with the discount that rises; with so few updates theirs keeps much less.
 """
 
 from __future__ import annotations

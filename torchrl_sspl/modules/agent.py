@@ -25,13 +25,13 @@ from torchrl_sspl.lipschitz import prove_lipschitz
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.modules.contrast import ContrastEncoder
 from torchrl_sspl.modules.controller import Controller
-from torchrl_sspl.modules.export import export
+from torchrl_sspl.modules.export import export, picture_of
 from torchrl_sspl.modules.moments import (
     BearingEncoder,
     MomentEncoder,
     TurnedBearingEncoder,
 )
-from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, as_pair, mlp
+from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy, mlp
 from torchrl_sspl.modules.observer import gain_matrix
 from torchrl_sspl.modules.shapes import ShapeBearingEncoder, ShapeEncoder, ShapePlaceEncoder
 
@@ -294,7 +294,7 @@ class Agent(nn.Module):
                 )
             bound, nets = float(body.pop("lipschitz_bound")), body["networks"]
             kinds = (ENCODERS, "encoder"), (DYNAMICS, "dynamics"), (POLICIES, "policy")
-            encoder, dynamics, policy = (_build(registry, nets[name], trust) for registry, name in kinds)
+            encoder, dynamics, policy = (_build(role, registry, nets[role], trust) for registry, role in kinds)
             agent = cls(encoder, dynamics, mlp_barrier(**nets["barrier"]), policy, bound, body)
             weights = load_file(path / WEIGHTS_FILE)
             if any(w.dtype == torch.float64 for w in weights.values()):
@@ -415,8 +415,7 @@ def _arguments(network: nn.Module, latent_dim: int) -> dict[str, Any]:
 def _read_as_written(agent: Agent) -> None:
     """A ConfigError if a network of your own would be read back as another one: with other arguments than it was made with."""
     generator = torch.Generator().manual_seed(0)
-    size = as_pair(getattr(agent.encoder, "image_size", None) or 64, "image_size")
-    pixels = torch.randint(256, (4, 6, *size), dtype=torch.uint8, generator=generator)
+    pixels = torch.randint(256, (4, *picture_of(agent)), dtype=torch.uint8, generator=generator)
     latent = (torch.rand(4, agent.latent_dim, generator=generator) * 2 - 1).to("cpu", agent.gain.dtype)
     _built_again("encoder", agent.encoder, (pixels,), agent.latent_dim)
     _built_again("policy", agent.policy, (latent,), agent.latent_dim)
@@ -451,7 +450,7 @@ def _built_again(role: str, network: nn.Module, inputs: tuple[Tensor, ...], late
         raise ConfigError(f"{role}: expected a network that computes the same when it is built again from {arguments}, received one that does not (it has and would have: {off}); {how}")
 
 
-def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bool) -> nn.Module:
+def _build(role: str, registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bool) -> nn.Module:
     name = spec["class"]
     if name not in registry and ":" not in name:
         raise CheckpointError(
@@ -462,7 +461,7 @@ def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bo
         raise CheckpointError(
             f"expected networks of this library, received '{name}', whose import runs code; if you trust whom the agent comes from, say so (trust)"
         )
-    nested = {k: _build(registry, v, trust) for k, v in spec["arguments"].items() if isinstance(v, dict) and "class" in v}
+    nested = {k: _build(role, registry, v, trust) for k, v in spec["arguments"].items() if isinstance(v, dict) and "class" in v}
     arguments = spec["arguments"] | nested
     try:
         if name in registry:
@@ -470,7 +469,7 @@ def _build(registry: dict[str, type[nn.Module]], spec: dict[str, Any], trust: bo
         kind = resolve(name)
         if not (isinstance(kind, type) and issubclass(kind, nn.Module)):
             raise CheckpointError(f"expected a class of networks (nn.Module), received '{name}', which is none")
-        return call_with(kind, arguments, next(role for known, role in ((ENCODERS, "encoder"), (DYNAMICS, "dynamics"), (POLICIES, "policy")) if known is registry))
+        return call_with(kind, arguments, role)
     except ConfigError as error:
         raise CheckpointError(f"the network '{name}' cannot be built: {error}") from error
 

@@ -124,7 +124,7 @@ def _required(package: str) -> Any:
 def _about(agent: Any) -> dict[str, Any]:
     """What a machine that runs the file has to know."""
     about = {
-        "pixels": list(_picture(agent)), "latent_dim": agent.latent_dim, "tolerated_error": agent.tolerated_error,
+        "pixels": list(picture_of(agent)), "latent_dim": agent.latent_dim, "tolerated_error": agent.tolerated_error,
         "action_scale": agent.policy.action_scale.flatten().tolist(), "weights": weights_digest(agent.state_dict()),  # type: ignore[operator, union-attr]
     }  # fmt: skip
     period = _period(agent)
@@ -149,7 +149,8 @@ def _period(agent: Any) -> float | None:
     return float(period) if isinstance(period, (int, float)) else None
 
 
-def _picture(agent: Any) -> tuple[int, int, int]:
+def picture_of(agent: Any) -> tuple[int, int, int]:
+    """Shape of the pictures that an agent takes; of an encoder that takes any size 64 x 64."""
     return 6, *_size(agent)
 
 
@@ -168,7 +169,7 @@ def _steps(agent: Any, n: int, seed: int) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(seed)
     scale = agent.policy.action_scale.flatten().cpu()  # type: ignore[operator, union-attr]
     return {
-        "pixels": torch.randint(256, (n, *_picture(agent)), generator=g, dtype=torch.uint8),
+        "pixels": torch.randint(256, (n, *picture_of(agent)), generator=g, dtype=torch.uint8),
         "latent": torch.rand(n, agent.latent_dim, generator=g) * 2 - 1,
         "action": (torch.rand(n, len(scale), generator=g) * 2 - 1) * scale,
         "begins": torch.rand(n, generator=g) < 0.5,

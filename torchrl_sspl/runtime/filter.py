@@ -218,15 +218,17 @@ class SafetyFilter(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Replace ``"action"`` ``(*batch, m)``, and say what was done."""
         batch = tensordict.batch_size
-        missing = [str(key) for key in (*self.observer.in_keys, "action") if key not in tensordict.keys(True)]
-        if missing:
+        try:
+            known, wanted = tensordict.select(*self.observer.in_keys), tensordict["action"]
+        except KeyError as error:
+            missing = [str(key) for key in (*self.observer.in_keys, "action") if key not in tensordict.keys(True)]
             raise ConfigError(
                 f"SafetyFilter: expected {missing} in the TensorDict, received none; in an environment append make_tensordict_primer() (and InitTracker), "
                 "which give 'prior' and 'is_init'; for single pictures take Monitor and Shield"
-            )
-        seen = self.observer(tensordict.select(*self.observer.in_keys))
+            ) from error
+        seen = self.observer(known)
         latent = seen["latent"]
-        rows, wanted = latent.reshape(-1, latent.shape[-1]), tensordict["action"]
+        rows = latent.reshape(-1, latent.shape[-1])
         made = self.shield(rows, wanted.reshape(-1, wanted.shape[-1]))
         found = {
             "latent": latent, "innovation": seen["innovation"], "action": made.action, "intervened": made.intervened[:, None],
