@@ -238,7 +238,7 @@ def _verify(words: list[str]) -> int:
     """
     parser = argparse.ArgumentParser(prog="sspl verify", description="Check the certificates of an agent again.")
     parser.add_argument("agent", help="name of a shipped agent, such as pendulum, or a run directory")
-    parser.add_argument("--measure", action="store_true", help="measure all episodes again, on the system that the agent names; implies --trust")
+    parser.add_argument("--measure", action="store_true", help="measure all episodes again, on the system that the agent names")
     parser.add_argument("--trust", action="store_true", help="run code of its own that the agent names: networks, a system")
     parser.add_argument("--seconds", type=float, default=900.0, help="time limit, without --measure (default: 900)")
     options = parser.parse_args(words)

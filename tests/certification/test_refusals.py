@@ -331,10 +331,10 @@ def test_a_certificate_of_networks_that_run_code_is_checked_on_request_alone(iss
     body = json.loads((directory / "agent.json").read_text())
     body["networks"]["encoder"] = {"class": "os:system", "arguments": {"latent_dim": f"touch {made}"}}
     (directory / "agent.json").write_text(json.dumps(body))
-    for options in ({}, {"trust": True}, {"measure": True}):
+    for options in ({}, {"measure": True}, {"trust": True}):
         lines: list[str] = []
         assert verify_run(directory, report=lines.append, **options) == Exit.AGENT
-        assert ("runs code" in lines[0]) == (not options)
+        assert ("runs code" in lines[0]) == ("trust" not in options)
     assert not made.exists()
 
 

@@ -128,6 +128,7 @@ MUTANTS = [
     (BLOCKS, "looks = torch.minimum(barrier, both.seen)", "looks = barrier", f"{LOOPS}::test_a_picture_of_u_that_looks_safe_counts_though_the_memory_knows_better"),
     (CERTIFY, "if agent.tolerated_error and claimed.level:", "if claimed.level > 0:", f"{LOOPS}::test_an_agent_that_tolerates_errors_is_certified_at_the_level_that_it_keeps"),
     (CERTIFY, "if measure and not blocks:", "if False:", f"{LOOPS}::test_measuring_all_again_fails_where_nothing_can_be_measured"),
+    (CERTIFY, "measure, trust, seconds, say)", "measure, trust or bool(measure), seconds, say)", f"{TWINS}::test_a_certificate_of_networks_that_run_code_is_checked_on_request_alone"),
     (CERTIFY, "Agent.load(directory, trust=trust)", "Agent.load(directory)", f"{TWINS}::test_a_certificate_of_networks_that_run_code_is_checked_on_request_alone"),
     (BLOCKS, "int((shown & ~(looks > level - m)).any(0).sum())", "0", f"{LOOPS}::test_resets_show_what_the_camera_hides"),
     (BLOCKS, "steps=int(start.alive[1:].sum())", "steps=int(start.alive.sum())", f"{LOOPS}::test_episodes_end_where_the_environment_ends_them"),

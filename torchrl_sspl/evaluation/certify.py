@@ -388,7 +388,7 @@ def verify_run(
     Args:
         name: name of a shipped agent, a run directory or the directory of an agent.
         env: the true system, or a maker of environments, where the agent does not say how to build it.
-        measure: True: measure all blocks again, whatever time it takes, and ``trust``; False: none; default: as above.
+        measure: True: measure all blocks again, whatever time it takes; False: none; default: as above.
         trust: import networks and a system that are not of this library, where the agent names such. That runs code, which could
             print anything: trust whom the agent comes from.
         seconds: time for everything (without ``measure=True``); proofs that are found sooner end sooner.
@@ -415,7 +415,7 @@ def verify_run(
 
     try:
         with time_limit(math.inf if measure else seconds):
-            _verify(directory, env, measure, trust or bool(measure), seconds, say)
+            _verify(directory, env, measure, trust, seconds, say)
         return int(Exit.HOLDS)
     except TimeUp:
         say(f"FAILED {Reason.UNDECIDED.name}: not checked within {seconds:g} s; give it more (seconds)")

@@ -154,7 +154,7 @@ class Monitor:
     of 1, on 16 x 16), ``texture`` (mean difference of neighbouring pixels, of 1: blur and noise), ``order`` (difference of a
     frame from itself one step later, of 1), ``still`` (steps during which not one pixel changed). A signal
     beyond its limit is an alarm, which ends after so many clean steps. Frames of another size or kind, missing frames and times that do not fit are alarms at once; the memory then goes on with
-    what it expects. Limits are the largest values of clean episodes (:func:`calibrate`), so that a clean episode has an
+    what it expects. Limits lie 5 % beyond the largest values of clean episodes (:func:`calibrate`), so that a clean episode has an
     alarm with a probability of at most :attr:`Calibration.false_alarms`. Source: none (novelty by reconstruction; limits by
     exchangeability, as in conformal prediction).
 
@@ -431,8 +431,8 @@ def calibrate(
 ) -> Calibration:
     """What clean pictures look like: a model of them, and limits from episodes of the agent.
 
-    The model is fitted to pictures of uniform states; the limits are the largest values of episodes that start in {B <= 0}. What is
-    shown here is never called strange. Cameras have noise: one that shows the very same frame twice is frozen. A simulator without
+    The model is fitted to pictures of uniform states; the limits lie 5 % beyond the largest values (of the texture, beyond the smallest,
+    too) of episodes that start in {B <= 0}. What is shown here is never called strange. Cameras have noise: one that shows the very same frame twice is frozen. A simulator without
     noise does that at rest, and a frozen camera cannot be told from it in time; calibrate with ``noise=0`` for it.
 
     Args:
