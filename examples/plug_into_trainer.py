@@ -70,7 +70,7 @@ def main(*overrides: str, batches: int = 19, updates: int = 400, loop: bool = Fa
         rounds.register(trainer)  # they run when all transitions are collected
         trainer.train()
     agent = Agent.from_loss(loss, level=work.level, **(work.acts() if phases else {}))  # behind the observer of the phases
-    agent.description["tolerated_error"] = premise(agent) if phases else 0.0  # its memory's corrections are held by it
+    agent.tolerated_error = premise(agent) if phases else 0.0  # its memory's corrections are held by it
     measured = evaluate(agent, env, config.evaluation, progress=True)
     return {name: measured[name] for name in SHOWN}
 

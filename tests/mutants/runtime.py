@@ -56,7 +56,7 @@ MUTANTS = [
     (FILTER, "for _ in range(_ROUNDS)", "for _ in range(0)", FILTERED),
     (FILTER, "            keeps = after[..., 0] <= most[:, None]\n", "            keeps = after[..., 0] < 9.0\n", FILTERED),
     (FILTER, "torch.where((first > 0)[:, None], tried[each, first - 1], lost)", "lost", FILTERED),
-    (FILTER, "agent.lipschitz_bound * agent.tolerated_error + 2.0 * rounding", "2.0 * rounding", FILTERED),
+    (FILTER, "agent.lipschitz_bound * (agent.tolerated_error + CUT) + 2.0 * rounding", "2.0 * rounding", FILTERED),
     (FILTER, "            after[:, -1] = then  # known\n", "", FILTERED),
     (FILTER, "made.predicted,", "self.agent.dynamics(rows, made.action),", FILTERED),
     (FILTER, "latent_dim, agent.barrier, agent.held_error, direction_of(agent.dynamics))", "latent_dim)", FILTERED),

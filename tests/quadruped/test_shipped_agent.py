@@ -11,7 +11,8 @@ import torchrl_sspl as sspl
 from torchrl_sspl.certification import Budget, Certificate
 from torchrl_sspl.envs.dubins import YAW_LAG, DubinsEnv
 from torchrl_sspl.evaluation import simulate, verify_run
-from torchrl_sspl.evaluation.certify import CERTIFICATE_FILE, _is_proved
+from torchrl_sspl.evaluation.beside import CERTIFICATE_FILE
+from torchrl_sspl.evaluation.certify import _is_proved
 from torchrl_sspl.evaluation.known import encode_states
 from torchrl_sspl.modules.agent import agent_directory
 

@@ -27,7 +27,7 @@ from torchrl_sspl.certification.rounding import LOWER_BOUNDS, missed
 from torchrl_sspl.errors import CertificationError
 from torchrl_sspl.files import write
 
-SCHEMA = 3
+SCHEMA = 4
 #: What a statement is; what is reported has a number and no verdict, and what is assumed has neither.
 PROVED, MEASURED, REPORTED, ASSUMED = "proved", "measured", "reported", "assumed"
 KINDS = (PROVED, MEASURED, REPORTED, ASSUMED)

@@ -344,7 +344,7 @@ def evaluation_rounding(system: ClosedLoop, *, unit: float = 2.0**-53, per_axis:
     ends = ([e[:-1] for e in edges], [e[1:] for e in edges])
     parts = zip(*(torch.cartesian_prod(*e).reshape(-1, system.latent_dim).split(512) for e in ends), strict=True)
     factor = _SHARPNESS if system.chooses else 1.0
-    return factor * max(float(rounding_bound(system.looped, a, b, unit)[-1].max()) for a, b in parts)
+    return factor * float(torch.stack([rounding_bound(system.looped, a, b, unit)[-1].max() for a, b in parts]).max())  # NaN stays NaN
 
 
 def closed_loop_lipschitz(dynamics: nn.Module, policy: nn.Module) -> float:

@@ -124,6 +124,7 @@ class Record:
         sizes: whole numbers by the names of :data:`SIZES`.
         numbers: numbers by the names of :data:`NUMBERS`.
         rims: rows of a table: part of the set, number of steps, largest error there.
+        among: which states those that are drawn are, where they are not all ("states"), as the system says it.
 
     Source: none.
     """
@@ -141,6 +142,7 @@ class Record:
     sizes: dict[str, int] = field(default_factory=dict)
     numbers: dict[str, float | None] = field(default_factory=dict)
     rims: list[tuple[str, int, float]] = field(default_factory=list)
+    among: str = ""
 
     def __post_init__(self) -> None:
         if min(self.episodes, self.horizon, self.envs) < 1 or not all(0.0 < x < 1.0 for x in (self.confidence, self.acceptable)):
@@ -199,6 +201,8 @@ class Record:
         for name, known in (("kind", _KINDS), ("system", _SYSTEMS)):
             if body[name] not in known:
                 raise CertificationError(f"expected {name} to be one of {', '.join(known)}, received {str(body[name])[:40]!r}")
+        if type(body["among"]) is not str or len(body["among"]) > 200 or not body["among"].isprintable():
+            raise CertificationError(f"expected among to be a line of text, received {str(body['among'])[:40]!r}")
         for name, low in (("seed", 0), ("episodes", 1), ("horizon", 1), ("envs", 1)):
             count(name, body[name], low, _LARGEST if name != "seed" else 2**64)
         for name in ("confidence", "acceptable"):
@@ -217,7 +221,7 @@ class Record:
             if type(row) is not list or len(row) != 3 or row[0] not in RIMS or len(rims) >= len(RIMS):
                 raise CertificationError(f"expected rims as [part of the set, steps, largest error], received {str(row)[:80]}")
             rims.append((row[0], count("steps", row[1], 1), finite("largest error", row[2], 0.0)))
-        plain = {k: body[k] for k in ("kind", "system", "seed", "episodes", "horizon", "envs", "confidence", "acceptable")}
+        plain = {k: body[k] for k in ("kind", "system", "seed", "episodes", "horizon", "envs", "confidence", "acceptable", "among")}
         record = cls(**plain, used=used, blocks=blocks, sizes=sizes, numbers=numbers, rims=rims)
         record.check()
         return record

@@ -14,7 +14,7 @@ from torchrl_sspl.certification.certificate import ASSUMED, MEASURED, REPORTED, 
 from torchrl_sspl.certification.record import REPEATED, Counts, Record
 from torchrl_sspl.certification.rounding import down
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.seeds import used_before
+from torchrl_sspl.seeds import drawn_for, used_before
 
 _QUANTILE = 0.99  # share of the episodes whose largest errors are bounded
 
@@ -155,8 +155,8 @@ def statistical_layer(record: Record, *, names_seeds: bool = True) -> Layer:
     if record.kind == "states":
         uniform = min(sum(n - n // 2 for n in map(record.size, range(len(record.blocks)))), total.shown)
         what = f"observations of U with B <= s, {uniform} drawn uniformly in U and {total.shown - uniform} where one step under a random "
-        what += "action enters it"
-        started = "uniformly (in a union: in equal shares of its parts) in the states whose observation lies in the set"
+        what += "action enters it" + (f", {record.among}" if record.among else "")
+        started = "uniformly (in a union: in equal shares of its parts) in the states whose observation lies in the set" + (f", {record.among}" if record.among else "")
     else:
         what = "episodes with an observation of U that show one with B <= s, half under the policy, half under random "
         what += "actions"
@@ -167,7 +167,7 @@ def statistical_layer(record: Record, *, names_seeds: bool = True) -> Layer:
     text = "both bounds hold at once (each bounds a share of its own kind; they are not added)"
     layer.state(REPORTED, "together", text, confidence=record.confidence)
     _errors(layer, record)
-    layer.state(ASSUMED, "seed", f"the seed of all this, {record.seed}, was not chosen by what was measured with it")
+    layer.state(ASSUMED, "seed", f"neither the seed of all this, {record.seed}, nor the agent was chosen by what was measured with it")
     layer.state(ASSUMED, "starts", f"episodes start as the measured ones did: {started}")
     layer.state(ASSUMED, "system", "camera, physics and appearance stay as they were")
     return layer
@@ -176,11 +176,12 @@ def statistical_layer(record: Record, *, names_seeds: bool = True) -> Layer:
 def _fresh(layer: Layer, record: Record, names_seeds: bool) -> None:
     """Whether nothing was seen before."""
     total, sizes = record.total, record.sizes
-    clash = any(used_before(seed, record.used or ()) for seed in record.seeds())
+    used, own = record.used or (), ("", "certificate", "certificate actions")
+    clash = any(used_before(seed, used) or any(drawn_for(seed, root) not in own for root in used) for seed in record.seeds())
     if record.used is None or not (names_seeds or clash):
         layer.state(ASSUMED, "fresh", "the episodes are fresh: the agent does not say which seeds it was trained with")
     else:
-        text = "no seed of these episodes was used to train, choose or tune"
+        text = "no seed of these episodes is one of the training, of what was chosen or tuned, or drawn from such a one for another purpose"
         layer.state(MEASURED, "fresh", text, not clash, Reason.CALIBRATION_REUSED, n=len(record.used))
     for name, what, known, found, n, reason in (
         ("different", "episodes that repeat another", 1, sizes["repeated"], total.episodes, Reason.CALIBRATION_REUSED),

@@ -23,15 +23,15 @@ def export_vnnlib(system: ClosedLoop, directory: str | Path, *, level: float = 0
 
     ``unsat`` confirms [V]. Of a policy that chooses it is a latent at which its own action is not accepted, and none of the table
     keeps the set: :math:`B(d(z, \pi(z))) \ge -m` and :math:`B(d(z, a_k)) \ge s` for all k. The network gives B(z), then these
-    values, in matrix products, sums and ReLU alone: a clamp is :math:`l + \operatorname{relu}(x - l) - \operatorname{relu}(x - h)`. Weights are float32, as deployed.
+    values, in matrix products, sums and ReLU alone: a clamp is :math:`l + \operatorname{relu}(x - l) - \operatorname{relu}(x - h)`. Weights are float32.
 
     Args:
         system: piecewise linear networks, of :func:`closed_loop`.
         directory: where ``invariance.onnx`` and ``invariance.vnnlib`` are written.
         level: s.
 
-    Returns the paths of network and property. Raises ConfigError for an activation that is not piecewise linear, or a policy that
-    accepts its own actions above this level, and MissingDependencyError without the package ``onnx``. Source: none.
+    Returns the paths of network and property. Raises ConfigError for an activation that is not piecewise linear, a policy that
+    accepts its own actions above this level, or weights and factors that float32 does not hold exactly, and MissingDependencyError without the package ``onnx``. Source: none.
 
     Example:
         >>> from tempfile import mkdtemp
@@ -75,7 +75,10 @@ class _Writer:
 
     def constant(self, value: Tensor | np.ndarray) -> str:
         name = f"c{len(self.constants)}"
-        array = np.ascontiguousarray(np.asarray(value), dtype=np.float32)
+        given = np.asarray(value, dtype=np.float64)
+        array = np.ascontiguousarray(given, dtype=np.float32)
+        if not np.array_equal(array, given):
+            raise ConfigError("expected weights and factors that float32 holds exactly, received others: another network than the proved one would be judged")
         self.constants.append(self.onnx.numpy_helper.from_array(array, name))
         return name
 

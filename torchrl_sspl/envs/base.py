@@ -213,6 +213,11 @@ class SafetyEnv(EnvBase):
         outside = ~self.state_space.contains(state)
         return torch.where(outside.unsqueeze(-1), torch.full_like(codes, self.exit_region), codes)
 
+    @property
+    def among(self) -> str:
+        """Which states :meth:`sample_states` draws, where these are not all; certificates say it."""
+        return ""
+
     def sample_states(
         self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None
     ) -> Tensor:

@@ -323,6 +323,11 @@ class DubinsEnv(SafetyEnv):
         before = state[..., :2] - step * torch.cat([heading.cos(), heading.sin()], -1)
         return torch.cat([before, heading, torch.zeros_like(state[..., 3:])], -1)
 
+    @property
+    def among(self) -> str:
+        """See ``SafetyEnv``."""
+        return "" if self.yaw_lag is None else "of robots that were walking straight ahead before"
+
     def sample_states(
         self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None
     ) -> Tensor:

@@ -308,13 +308,13 @@ class ResetBlocks:
         looks = torch.minimum(barrier, both.seen)  # a picture alone may look safe where the memory knows better
         start = own.select(~(own_barrier[0] > level))  # a start that is no number counts, as an event
         shown, margin = (both.region == UNSAFE) & both.alive, _BARELY * _scale(barrier[both.alive], level)
-        seen = both.latent[both.alive]
+        outside = both.outside[both.alive]
         counts, least = (
             replace(
                 NOTHING, episodes=len(start), steps=int(start.alive[1:].sum()),
                 **counted(start, level, self.tolerated, s, self.held)[0],
                 shown=int(shown.any(0).sum()), mistaken=int((shown & ~(looks > level - m)).any(0).sum()),
-                seen=len(seen), outside=int((~(seen.abs() <= 1.0).all(1)).sum()),
+                seen=len(outside), outside=int(outside.sum()),
             )
             for s, m in ((0.0, 0.0), (_BARELY, margin))
         )  # fmt: skip
@@ -394,7 +394,8 @@ def summarise(record: Record, blocks: Sequence[Block], agent: Agent) -> None:
     leaked = sum(p in known for b in blocks for p in b.labelled)
     sizes |= lengths | {"repeated": n - len(set(prints)), "trained_on": compared_labels(agent, record), "leaked": leaked}
     record.sizes |= sizes
-    bound = largest_error_bound(error, record.confidence) if n else math.nan
+    different = dict(zip(prints, error.tolist(), strict=True))  # of episodes that repeat another one
+    bound = largest_error_bound(list(different.values()), record.confidence) if n else math.nan
     numbers |= {"episode_error": bound}
     record.numbers |= {k: v if math.isfinite(v) else None for k, v in numbers.items()}
     record.rims = []

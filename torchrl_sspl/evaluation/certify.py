@@ -23,7 +23,6 @@ from torchrl_sspl.certification.certificate import (
     Certificate,
     Layer,
     Reason,
-    configuration_digest,
     differences,
     effort,
     weights_digest,
@@ -37,6 +36,7 @@ from torchrl_sspl.certification.rounding import LOWER_BOUNDS, line_of, printable
 from torchrl_sspl.certification.statistics import paper_layer, run_time_layer, statistical_layer
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import CertificationError, CheckpointError, ConfigError, SSPLError
+from torchrl_sspl.evaluation.beside import CERTIFICATE_FILE, configuration_of
 from torchrl_sspl.evaluation.blocks import (
     Block,
     MakeEnv,
@@ -56,15 +56,9 @@ from torchrl_sspl.interrupts import TimeUp, time_limit
 from torchrl_sspl.journal import journal, kept
 from torchrl_sspl.modules.agent import Agent, agent_directory
 from torchrl_sspl.modules.choosing import ChoosingPolicy
+from torchrl_sspl.modules.observer import CUT
 
-CERTIFICATE_FILE = "certificate.json"
 _BROKEN = (SSPLError, ImportError, RuntimeError, TypeError, ValueError)
-#: What a certificate is about; everything else in the description (the certificate's own traces, notes) may change.
-_CERTIFIED_KEYS = ("networks", "config", "training", "lipschitz", "seeds", "environment", "trained_on", "tolerated_error")
-
-
-#: More than a correction that is cut to a length, computed in float32, is longer than that: 2^-22 an entry of up to ten, of [-1, 1].
-_CUT = 1e-6
 #: How far beyond the Lipschitz argument a tolerated error is looked for, in how many steps, and with how many boxes each.
 _FARTHEST, _HALVINGS, _PATIENCE = 1.7, 4, 50_000
 _ROUNDINGS = ("barrier_rounding", "step_rounding")
@@ -131,7 +125,7 @@ def certify(
     factory = described_system(agent.description)
     system = "described" if factory is not None and same_system(env, factory) else "given"
     root, used = _root_seed(agent) if seed is None else seed, _used(agent, used_seeds)
-    record = Record("states", system, root, episodes, horizon, 1, confidence, acceptable, used)
+    record = Record("states", system, root, episodes, horizon, 1, confidence, acceptable, used, among=env.among)
     certificate = _proved(agent, name, level, budget)
     return _measured(certificate, agent, StateBlocks(agent, env, record, certificate.level), progress)
 
@@ -204,7 +198,7 @@ def issue(path: str | Path, env: SafetyEnv | MakeEnv | None = None, **settings: 
         if before.record is not None:
             names = ("episodes", "horizon", "seed", "confidence", "acceptable")
             used = {"used_seeds": before.record.used or ()}  # what was said to be used is used for ever
-            settings = {k: getattr(before.record, k) for k in names} | used | settings
+            settings = {k: getattr(before.record, k) for k in names} | used | _of_changed(before, agent) | settings
             envs = {"envs": before.record.envs} if before.record.kind == "resets" else {}
     except CertificationError:
         settings = {"name": directory.parent.name if directory.name == "agent" else directory.name} | settings
@@ -218,6 +212,14 @@ def issue(path: str | Path, env: SafetyEnv | MakeEnv | None = None, **settings: 
         certificate = certify_on_episodes(agent, env, **(envs | settings))
     certificate.save(directory / CERTIFICATE_FILE)
     return certificate
+
+
+def _of_changed(before: Certificate, agent: Agent) -> dict[str, Any]:
+    """For an agent that may have been changed by what its certificate says: another seed, and the old ones as used."""
+    record = before.record
+    if record is None or before.weights == weights_digest(agent.state_dict()):
+        return {}
+    return {"seed": record.seed + 1, "used_seeds": [*(record.used or ()), record.seed, *record.seeds()]}
 
 
 def _root_seed(agent: Agent) -> int:
@@ -248,12 +250,7 @@ def _proved(agent: Agent, name: str, level: float | None, budget: Budget | None)
         level = level_that_holds(**_loop(agent), budget=budget)
     label = re.sub(r"[^\w .,()+-]", "_", name)[:80] or "agent"
     layers = {"deterministic": _proof(agent, level, budget)}
-    return Certificate(label, weights_digest(agent.state_dict()), _configuration(agent), level, layers)
-
-
-def _configuration(agent: Agent) -> str:
-    certified = {k: agent.description.get(k) for k in _CERTIFIED_KEYS} | {"lipschitz_bound": agent.lipschitz_bound}
-    return configuration_digest(certified)
+    return Certificate(label, weights_digest(agent.state_dict()), configuration_of(agent), level, layers)
 
 
 def _loop(agent: Agent) -> dict[str, Any]:
@@ -273,7 +270,7 @@ def _proof(agent: Agent, level: float, budget: Budget, required: float | None = 
 def premise(agent: Agent, *, budget: Budget | None = None) -> float:
     """Error per step that {B <= 0} is proved to tolerate, by the numbers that the agent computes; 0 where it is not kept.
 
-    This is what an agent's run-time monitor compares with: put it into ``agent.description["tolerated_error"]``. It is a
+    This is what an agent's run-time monitor compares with: set ``agent.tolerated_error`` to it. It is a
     thousandth smaller than what was found, so that another machine finds it, too, and by what computing a correction of this
     length may round off. Source: none.
 
@@ -301,7 +298,7 @@ def premise(agent: Agent, *, budget: Budget | None = None) -> float:
             low = middle
         else:
             high = middle
-    return max(0.0, 0.999 * low - _CUT)
+    return max(0.0, 0.999 * low - CUT)
 
 
 def _witness(agent: Agent) -> list[Tensor] | None:
@@ -449,7 +446,7 @@ def _verify(
     began = time.monotonic()
     if agent.tolerated_error and claimed.level:
         _refuse({Reason.LEVEL: f"expected 0, at which its controller and its filter keep the set, found {claimed.level:g}"})
-    again = Certificate(claimed.agent, weights_digest(agent.state_dict()), _configuration(agent), claimed.level, {})
+    again = Certificate(claimed.agent, weights_digest(agent.state_dict()), configuration_of(agent), claimed.level, {})
     again.layers["deterministic"] = claimed.layers["deterministic"]  # first what takes no time
     if claimed.record is not None:
         again.layers |= _measured_layers(claimed.record, claimed, agent)
@@ -534,6 +531,8 @@ def _measured_again(
     kind: Any = StateBlocks if record.kind == "states" else ResetBlocks
     if (record.kind == "states") != isinstance(env, SafetyEnv):
         raise _Stop(Exit.REFUSED, f"FAILED {Reason.RECORD_CHANGED.name}: the episodes are of another kind of system")
+    if record.kind == "states" and record.among != env.among:
+        _refuse({Reason.RECORD_CHANGED: f"claimed of states {record.among!r}, the system draws states {env.among!r}"})
     source = kind(agent, env, record, claimed.level, _tolerated(claimed, agent))
     order, began = list(range(len(record.blocks))), time.monotonic()
     random.SystemRandom().shuffle(order)

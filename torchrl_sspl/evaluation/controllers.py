@@ -28,6 +28,7 @@ class Decision:
     barrier: Tensor = _NONE  # (n,), at most zero means safe
     seen: Tensor = _NONE  # (n,) barrier of what is seen by itself, without memory
     latent: Tensor = _NONE  # (n, p)
+    outside: Tensor = _NONE  # (n,) bool, whether what the encoder gives lies outside [-1, 1] or is no number
     innovation: Tensor = _NONE  # (n, p) what is seen, less what was expected
     cut: Tensor = _NONE  # (n,) bool, whether its correction was cut so that the set is not left
     predicted: Tensor = _NONE  # (n, p) the next latent that it expects
@@ -170,9 +171,10 @@ class AgentController:
 
     def _judge(self, observation: Tensor | Camera, rows: Tensor | None) -> Decision:
         """What is thought of all n episodes after a look at some of them."""
-        seen, barrier = self._see(observation, rows), self.agent.barrier
-        latent, innovation, cut, seen = self._memory.correct(seen)
-        return Decision(barrier=barrier(latent)[:, 0], seen=barrier(seen)[:, 0], latent=latent, innovation=innovation, cut=cut)
+        encoded, barrier = self._see(observation, rows), self.agent.barrier
+        latent, innovation, cut, seen = self._memory.correct(encoded)
+        outside = ~(encoded.abs() <= 1.0).all(1)  # the memory never does
+        return Decision(barrier=barrier(latent)[:, 0], seen=barrier(seen)[:, 0], latent=latent, outside=outside, innovation=innovation, cut=cut)
 
     def _see(self, observation: Tensor | Camera, rows: Tensor | None) -> Tensor:
         """Encoded observations of all n episodes, after a look at some of them."""

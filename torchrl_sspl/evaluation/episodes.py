@@ -95,7 +95,8 @@ def evaluate_episodes(
 def _labels(out: Evaluation, episodes: Episodes) -> None:
     """How often the barrier errs about a labelled observation, by episodes and by observations."""
     inside = episodes.barrier <= 0
-    looks_safe = inside if episodes.seen is None else inside | (episodes.seen <= 0)  # by what was remembered, or by the picture alone, as certificates count
+    # By what was remembered, or by the picture alone, as certificates count; NaN is an error of either kind.
+    looks_safe = ~(episodes.barrier > 0) if episodes.seen is None else ~((episodes.barrier > 0) & (episodes.seen > 0))
     for name, code in _CALLED.items():
         labelled, wrong = (episodes.region == code) & episodes.alive, looks_safe if code == UNSAFE else ~inside
         label, n = "U" if code == UNSAFE else "S", int(labelled.sum())
@@ -107,7 +108,7 @@ def _labels(out: Evaluation, episodes: Episodes) -> None:
 
 def _from_the_set(out: Evaluation, own: Episodes, touches: torch.Tensor) -> None:
     """What happens to episodes that start with B <= 0."""
-    starts, leaves = own.barrier[0] <= 0, ((own.barrier > 0) & own.alive).any(0)
+    starts, leaves = own.barrier[0] <= 0, (~(own.barrier <= 0) & own.alive).any(0)
     longest = int(own.alive.sum(0).max()) - 1  # the environment may end them before the horizon
     note = f"episodes of at most {longest} steps from B <= 0 under the policy"
     out.count("starts_inside", starts, "resets with B <= 0")

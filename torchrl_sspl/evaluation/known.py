@@ -16,7 +16,7 @@ from torchrl_sspl.configs.schema import EvaluationConfig
 from torchrl_sspl.data.augmentation import Augmentation
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.evaluation.controllers import CHUNK, AgentController, Camera, Controller, as_controller
-from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, lipschitz, quantiles, share
+from torchrl_sspl.evaluation.measurements import Draw, Evaluation, Measurement, lipschitz, quantiles, refutes, share
 from torchrl_sspl.evaluation.simulation import Episodes, looked_at, simulate
 from torchrl_sspl.journal import kept_parts
 from torchrl_sspl.modules.agent import Agent, on_host
@@ -214,7 +214,7 @@ def _sets(run: _Run) -> Tensor | None:
         return None
     member, doomed = barrier <= 0, ~unsafe & ~viable
     on_grid = f"{sizes} states per dimension" if isinstance(sizes, int) else f"{_times(sizes)} states"
-    out.count(names[1], safe_barrier > 0, "uniform samples of S")
+    out.count(names[1], ~(safe_barrier <= 0), "uniform samples of S")  # NaN is an error of either kind
     for name, events, of, note in (
         (names[2], member & viable, viable, f"true kernel, {on_grid}"),
         (names[3], member & ~viable, member, f"{{B<=0}} outside the true kernel, {on_grid}"),
@@ -227,7 +227,7 @@ def _sets(run: _Run) -> Tensor | None:
     out.arrays.update(barrier=barrier, **({} if latent is None else {"latent": latent}))
     in_unsafe, note = _unsafe_barrier(run, barrier[unsafe], on_grid)
     note += "" if len(in_unsafe) else ", of which none lies in U"
-    out.count("unsafe_called_safe", in_unsafe <= 0, note, independent=False)
+    out.count("unsafe_called_safe", ~(in_unsafe > 0), note, independent=False)
     if len(in_unsafe):
         worst = float(-in_unsafe.min())
         out.add(Measurement("worst_unsafe_barrier", worst, "barrier", len(in_unsafe), note="q2: largest -B on U"))
@@ -259,6 +259,9 @@ def _unsafe_barrier(run: _Run, on_state_grid: Tensor, on_grid: str) -> tuple[Ten
 
 def _lipschitz(run: _Run, agent: Agent) -> None:
     lower = lipschitz(run.out, agent, run.generator)
+    if refutes(lower, agent):
+        run.out.missing("lipschitz_ratio", unit="ratio", note="the bound that is claimed is none")
+        return
     run.out.add(Measurement("lipschitz_ratio", lower / agent.lipschitz_bound, "ratio", note="sampled over the bound"))
 
 
@@ -311,10 +314,10 @@ def _from_the_set(run: _Run) -> None:
     found = run.episodes(start, "{B<=0}")
     barrier = found.barrier
     out.count("safe_rollouts_touch_unsafe", _touched(found), note)
-    out.count("safe_rollouts_leave", (barrier > 0).any(0), note)
+    out.count("safe_rollouts_leave", (~(barrier <= 0)).any(0), note)
     stepped = looked_at(found, env)[1:]
     if run.agent is not None and run.agent.held_error > 0:  # of the memory it is proved; what is seen may lie outside
-        out.count("safe_rollouts_seen_outside", (found.seen > 0).any(0), f"{note}, B > 0 for an observation by itself")
+        out.count("safe_rollouts_seen_outside", (~(found.seen <= 0)).any(0), f"{note}, B > 0 for an observation by itself")
         out.count("corrections_cut", found.cut[1:] & stepped, f"steps of {note}, correction that would leave the set", stepped, independent=False)
     error, barrier_error = found.prediction_error, found.barrier_error
     if error is not None and barrier_error is not None:

@@ -149,7 +149,7 @@ def write_metrics(outcome: Outcome) -> Path:
         "training_seconds": outcome.seconds,
         "stop_reason": outcome.stop_reason,
         "budget": outcome.budget,
-        "lipschitz": {k: v for k, v in proof.items() if k != "multipliers"},
+        "lipschitz": {k: v for k, v in proof.items() if k != "multipliers"} | {"proved": outcome.agent.lipschitz_proved},
         "checks": [asdict(c) if is_dataclass(c) else dict(c) for c in outcome.checks],  # type: ignore[arg-type]
         "measurements": {name: evaluation.to_dict() for name, evaluation in outcome.evaluations.items()},
         "verdicts": verdicts,

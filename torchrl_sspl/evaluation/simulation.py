@@ -44,6 +44,7 @@ class Episodes:
         barrier: ``(T + 1, n)`` barrier value B(z_t) of the latent; None without a barrier, as what follows.
         seen: ``(T + 1, n)`` B(E(o_t)), of what was observed by itself.
         latent: ``(T + 1, n, p)``.
+        outside: ``(T + 1, n)`` bool, where E(o_t) lies outside the domain or is no number.
         innovation: ``(T + 1, n, p)`` E(o_t) less what was expected; zero where an episode begins.
         cut: ``(T + 1, n)`` bool, where a correction was cut so that the set is not left.
         prediction_error: ``(T, n)`` norm of z_{t+1} - d(z_t, u_t), of which without an observer z_{t+1} = E(o_{t+1}).
@@ -59,6 +60,7 @@ class Episodes:
     barrier: Tensor = _NONE
     seen: Tensor = _NONE
     latent: Tensor = _NONE
+    outside: Tensor = _NONE
     innovation: Tensor = _NONE
     cut: Tensor = _NONE
     prediction_error: Tensor = _NONE
@@ -193,7 +195,7 @@ class _Record:
         values = {"barrier": decision.barrier, "seen": decision.seen}
         if gone is not None:
             values = {k: None if v is None else v.masked_fill(gone, -1.0) for k, v in values.items()}
-        kept = {k: getattr(decision, k) for k in ("latent", "innovation", "cut")}
+        kept = {k: getattr(decision, k) for k in ("latent", "outside", "innovation", "cut")}
         self.add(region=region, alive=alive.clone(), **kept, **values)
 
     def compare(self, before: Decision, after: Decision, gone: Tensor | None = None) -> None:

@@ -279,7 +279,7 @@ def _notes(outcome: Outcome, env: SafetyEnv | None) -> list[str]:
 
 def _proved(outcome: Outcome) -> list[str]:
     """The agent's own proof."""
-    if not getattr(outcome.agent, "description", {}).get("lipschitz", {}).get("proved"):
+    if not getattr(outcome.agent, "lipschitz_proved", False):
         return []
     bound = f"{outcome.agent.lipschitz_bound:g}"
     return [f"The deployed float32 barrier is {bound}-Lipschitz on all of its domain (exact integer arithmetic)."]

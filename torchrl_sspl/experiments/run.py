@@ -30,7 +30,8 @@ from torchrl_sspl.data.collect import ExploringPolicy, RandomActions, make_colle
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.envs.base import LARGEST_ACTION, SafetyEnv
 from torchrl_sspl.errors import CheckpointError, ConfigError, EmptyRegionError, MissingDependencyError, OutputError
-from torchrl_sspl.evaluation.certify import CERTIFICATE_FILE, certify, certify_on_episodes, premise
+from torchrl_sspl.evaluation.beside import CERTIFICATE_FILE, certificate_beside
+from torchrl_sspl.evaluation.certify import certify, certify_on_episodes, premise
 from torchrl_sspl.evaluation.episodes import evaluate_episodes, logged
 from torchrl_sspl.evaluation.known import evaluate
 from torchrl_sspl.evaluation.measurements import Evaluation, Measurement
@@ -348,7 +349,7 @@ class Experiment:
         agent = self.agent()
         agent.description["stop_reason"] = self.stop_reason()
         with journal(self.directory, "premise", weights_digest(agent.state_dict())):
-            agent.description["tolerated_error"] = premise(agent, budget=Budget(seconds=self.config.evaluation.certificate_seconds))
+            agent.tolerated_error = premise(agent, budget=Budget(seconds=self.config.evaluation.certificate_seconds))
         agent.save(self.directory / "agent")
         return agent
 
@@ -442,8 +443,8 @@ class Experiment:
                 certificate = self.certify(agent)
         if not trained:
             self.trainer.collector.shutdown()
-            beside = agent_directory(self.config.agent) / CERTIFICATE_FILE
-            certificate = Certificate.load(beside) if beside.is_file() else None
+            certificate, why = certificate_beside(agent_directory(self.config.agent), agent)
+            self.work.warnings += [why] if why else []
         outcome = Outcome(
             directory=self.directory,
             agent=agent.cpu(),

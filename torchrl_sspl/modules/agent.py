@@ -7,6 +7,7 @@ import inspect
 import json
 import math
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from safetensors.torch import load_file
 from safetensors.torch import save as as_bytes
 from torch import Tensor, nn
 
+from torchrl_sspl.certification.certificate import weights_digest
 from torchrl_sspl.configs.reader import resolve
 from torchrl_sspl.devices import usable_device
 from torchrl_sspl.errors import CheckpointError, ConfigError
@@ -51,6 +53,11 @@ def mlp_barrier(latent_dim: int, hidden: list[int]) -> nn.Sequential:
     return mlp((latent_dim, *hidden, 1))
 
 
+def _check_error(error: Any) -> None:
+    if type(error) not in (int, float) or not 0.0 <= error < math.inf:
+        raise ConfigError(f"expected a tolerated error that is finite and not negative, received {str(error)[:40]!r}")
+
+
 #: Networks that an agent on disk may name; extend it before loading an agent with networks of your own.
 ENCODERS: dict[str, type[nn.Module]] = {
     "FrameEncoder": FrameEncoder, "ContrastEncoder": ContrastEncoder, "MomentEncoder": MomentEncoder, "ShapeEncoder": ShapeEncoder,
@@ -78,7 +85,8 @@ class Agent(nn.Module):
         lipschitz_bound: Lipschitz constant of ``barrier`` with respect to the Euclidean norm, as claimed; whether it was proved is in
             ``description["lipschitz"]``, and ``sspl verify`` proves it anew.
         description: how to build the networks again, and whatever else should travel with the agent;
-            ``"tolerated_error"`` is the error below which its proof applies at run time.
+            ``"tolerated_error"`` is the error below which its proof applies at run time, ``"proof_of"`` the digest of the weights of which
+            that and ``"lipschitz"`` were proved: of others nothing is.
         gain: K of the latent observer, a number or ``(p, p)``; 1: the latent is what is seen.
 
     Raises ConfigError for a barrier in training, or a gain or a tolerated error that is not valid.
@@ -122,11 +130,10 @@ class Agent(nn.Module):
             matrix = gain.detach().cpu().clone()
         first: Any = self.barrier[0]
         self.register_buffer("gain", matrix.to(first.weight.dtype))
-        error = self.description.get("tolerated_error", 0.0)
-        if type(error) not in (int, float) or not 0.0 <= error < math.inf:
-            raise ConfigError(f"expected a tolerated error that is finite and not negative, received {str(error)[:40]!r}")
+        _check_error(self.description.get("tolerated_error", 0.0))
         self.eval()
         self.requires_grad_(False)
+        self._tie()
 
     @classmethod
     def from_networks(
@@ -175,7 +182,11 @@ class Agent(nn.Module):
         networks: dict[str, Any] = {k: _describe(net, latent_dim) for k, net in named.items()}
         body = {**(description or {}), "networks": networks | {"barrier": {"latent_dim": latent_dim, "hidden": hidden}}}
         body["lipschitz"] = {"proved": proof.proved, "reason": proof.reason, "multipliers": witness}
-        return cls(nets[0], nets[1], deployed, nets[3], bound, body, gain)
+        before = body.pop("proof_of", None)
+        agent = cls(nets[0], nets[1], deployed, nets[3], bound, body, gain)
+        if before not in (None, agent.description["proof_of"]):  # the description of another agent
+            agent.description.pop("tolerated_error", None)
+        return agent
 
     @classmethod
     def from_loss(cls, loss: Any, **options: Any) -> Agent:
@@ -227,8 +238,35 @@ class Agent(nn.Module):
 
     @property
     def tolerated_error(self) -> float:
-        """Error per step, latent units, up to which the proof applies at run time; 0 where nothing is proved."""
-        return float(self.description.get("tolerated_error", 0.0))
+        """Error per step, latent units, up to which the proof applies at run time; 0 where nothing is proved of these weights.
+
+        Set it to what :func:`~torchrl_sspl.evaluation.certify.premise` finds; a ConfigError for what is negative or not finite.
+        """
+        return 0.0 if self._of_others else float(self.description.get("tolerated_error", 0.0))
+
+    @tolerated_error.setter
+    def tolerated_error(self, error: float) -> None:
+        _check_error(error)
+        if self._of_others:
+            self.description["lipschitz"] = {**self.description.get("lipschitz", {}), "proved": False, "reason": "proved of other weights"}
+        self.description |= {"tolerated_error": error, "proof_of": self._proof_digest()}
+        self._of_others = False
+
+    @property
+    def lipschitz_proved(self) -> bool:
+        """Whether ``lipschitz_bound`` was proved of these weights, as the description says; ``sspl verify`` proves it anew."""
+        said = self.description.get("lipschitz")
+        return isinstance(said, dict) and said.get("proved") is True and not self._of_others
+
+    def _proof_digest(self) -> str:
+        """Digest of what proofs are about: all but the encoder, as numbers of whatever type."""
+        state = {name: value.double() for name, value in self.state_dict().items() if not name.startswith("encoder.")}
+        return weights_digest(state | {"lipschitz_bound": torch.tensor(self.lipschitz_bound, dtype=torch.float64)})
+
+    def _tie(self) -> None:
+        """Finds out whether what the description says was proved is about these weights; where it does not say, it is."""
+        claims = not self.description.keys().isdisjoint(("lipschitz", "tolerated_error"))
+        self._of_others = claims and self.description.setdefault("proof_of", digest := self._proof_digest()) != digest
 
     @property
     def held_error(self) -> float:
@@ -295,6 +333,7 @@ class Agent(nn.Module):
             bound, nets = float(body.pop("lipschitz_bound")), body["networks"]
             kinds = (ENCODERS, "encoder"), (DYNAMICS, "dynamics"), (POLICIES, "policy")
             encoder, dynamics, policy = (_build(role, registry, nets[role], trust) for registry, role in kinds)
+            said = body.pop("proof_of", None)
             agent = cls(encoder, dynamics, mlp_barrier(**nets["barrier"]), policy, bound, body)
             weights = load_file(path / WEIGHTS_FILE)
             if any(w.dtype == torch.float64 for w in weights.values()):
@@ -313,6 +352,14 @@ class Agent(nn.Module):
                 raise CheckpointError(
                     f"expected finite weights in '{path}', received NaN or infinity in '{name}'; restore the files"
                 )
+        agent.description.pop("proof_of", None)  # of the weights that it was built with
+        agent.description |= {} if said is None else {"proof_of": said}
+        agent._tie()
+        if agent._of_others:
+            warnings.warn(
+                f"'{path}' says what was proved of other weights, so that it counts as not proved; set agent.tolerated_error = premise(agent), "
+                "save the agent and certify it", stacklevel=2,
+            )  # fmt: skip
         return agent.to(device)
 
 

@@ -16,6 +16,9 @@ from torchrl_sspl.direction import Direction, direction_of, within
 from torchrl_sspl.errors import ConfigError, ShapeError
 from torchrl_sspl.modules.salad import as_tensordict_module, written
 
+#: More than a correction that is cut to a length, computed in float32, is longer than that: 2^-22 an entry of up to ten, of [-1, 1].
+CUT = 1e-6
+
 
 def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int, seen_dim: int | None = None) -> Tensor:
     """The gain K ``(p, p)`` of an observer, from a number k (K = k I) or a matrix. Source: none.

@@ -17,7 +17,7 @@ from torchrl_sspl.devices import compiled
 from torchrl_sspl.direction import direction_of
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.modules.agent import Agent
-from torchrl_sspl.modules.observer import LatentObserver
+from torchrl_sspl.modules.observer import CUT, LatentObserver
 
 MODES = ("nearest", "blend")
 LEVEL = -0.12
@@ -170,13 +170,13 @@ class Shield:
 
 
 def _proved_margin(agent: Agent) -> float:
-    r""":math:`L_B \delta + 2 \epsilon_B`."""
+    r""":math:`L_B (\delta + \kappa) + 2 \epsilon_B`; :math:`\kappa`: by how much a correction that float32 cuts to :math:`\delta` may be longer."""
     system = closed_loop(
         agent.barrier, agent.dynamics, agent.policy, latent_dim=agent.latent_dim, lipschitz_bound=agent.lipschitz_bound
     )
     unit = UNITS[next(agent.barrier.parameters()).dtype]
     rounding = largest_rounding(system.barrier, system.low, system.high, unit)
-    return agent.lipschitz_bound * agent.tolerated_error + 2.0 * rounding
+    return agent.lipschitz_bound * (agent.tolerated_error + CUT) + 2.0 * rounding
 
 
 class SafetyFilter(TensorDictModuleBase):

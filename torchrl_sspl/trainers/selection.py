@@ -134,7 +134,7 @@ class CheckRound(Phase):
         apart = [v for v in levels if all(found <= most for _, found, most in self._mixed(work, held_out, v))]
         for level in apart[::_STEP][:_TRIED]:
             agent = work.agent(level)
-            agent.description["tolerated_error"] = tolerated = premise(agent)
+            agent.tolerated_error = tolerated = premise(agent)
             fresh = self._held_out(work, agent) if tolerated > 0 else None
             if fresh is None:
                 continue
