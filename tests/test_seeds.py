@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchrl_sspl.errors import ConfigError
-from torchrl_sspl.seeds import PURPOSES, spawn, used_before
+from torchrl_sspl.seeds import PURPOSES, drawn_for, spawn, used_before
 
 
 @pytest.mark.parametrize("seed", [0, 1, 20260707, 2**40 + 3])
@@ -40,3 +40,11 @@ def test_what_a_generator_forgets_of_a_seed_is_no_difference():
 def test_what_is_not_registered_is_refused(seed, purpose, index):
     with pytest.raises(ConfigError):
         spawn(seed, purpose, index)
+
+
+def test_the_purpose_of_a_seed_is_found():
+    for root in (0, 7, 2**40 + 3):
+        for purpose in PURPOSES:
+            assert {drawn_for(spawn(root, purpose, k), root) for k in (0, 1, 4095)} == {purpose}
+            assert drawn_for(spawn(root, purpose, 4096), root) == ""
+    assert {drawn_for(spawn(1, purpose), root) for purpose in PURPOSES for root in (2, -1)} == {""}

@@ -435,7 +435,7 @@ def choosing_line(margin: float = 0.15, actions: Any = ((-2.0,), (0.0,), (2.0,))
 def issued_choosing(tmp_path_factory) -> Path:
     directory = tmp_path_factory.mktemp("issued_choosing")
     agent = choosing_line()
-    agent.description["tolerated_error"] = premise(agent)
+    agent.tolerated_error = premise(agent)
     assert 0.09 < agent.tolerated_error < 0.1
     agent.save(directory)
     certificate = certify(agent, Line(), name="line", episodes=300, horizon=4, acceptable=0.02)

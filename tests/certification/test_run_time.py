@@ -28,6 +28,7 @@ def observed(tmp_path_factory) -> Path:
     directory = tmp_path_factory.mktemp("observed")
     agent = line_agent(tolerated_error=0.1)
     agent.gain = gain_matrix(0.5, 2)
+    agent.tolerated_error = 0.1  # of this agent
     agent.save(directory)
     certify(agent, Line(), name="line", episodes=300, horizon=4, acceptable=0.02).save(directory / "certificate.json")
     return directory

@@ -28,6 +28,7 @@ def cancelling(**description: Any) -> Agent:
     net[0].bias.data[0] = large
     net[2].weight.data[0] = torch.tensor([0.8, 0.0, 0.0, 0.0])
     net[2].bias.data[0] = -float(net[2].weight[0, 0]) * large
+    agent.tolerated_error = agent.tolerated_error  # of these weights
     return agent
 
 
@@ -79,6 +80,7 @@ def test_where_there_is_no_time_to_look_in_every_direction_nobody_is_called_a_li
     first, last = agent.barrier[0], agent.barrier[-1]
     for parameter, values in ((first.weight, [[1.0, 0.0]] + 3 * [[0.0, 0.0]]), (first.bias, [2.0, 0.0, 0.0, 0.0]), (last.weight, [[1.0, 0.0, 0.0, 0.0]]), (last.bias, [-2.5])):
         parameter.data.copy_(torch.tensor(values))
+    agent.tolerated_error = 0.1995  # of these weights
     agent.save(tmp_path)
     certificate = certify(agent, None, name="line")
     assert certificate.layers["deterministic"]["tolerated error"].detail == EVERY_WAY

@@ -15,10 +15,11 @@ from torchrl_sspl.errors import ConfigError, MissingDependencyError
 from torchrl_sspl.modules import LatentDynamics, Policy
 
 
-def system(activation: type[nn.Module] = nn.ReLU, **options):
+def system(activation: type[nn.Module] = nn.ReLU, dtype: torch.dtype = torch.float32, **options):
     torch.manual_seed(0)
-    barrier = nn.Sequential(nn.Linear(3, 8), activation(), nn.Linear(8, 1))
-    return closed_loop(barrier, LatentDynamics(3, 1, (8,), 2.0), Policy(3, 1, (8,), 2.0), latent_dim=3, lipschitz_bound=9.0, **options)
+    barrier = nn.Sequential(nn.Linear(3, 8, dtype=dtype), activation(), nn.Linear(8, 1, dtype=dtype))
+    parts = (net.to(dtype) for net in (LatentDynamics(3, 1, (8,), 2.0), Policy(3, 1, (8,), 2.0)))
+    return closed_loop(barrier, *parts, latent_dim=3, lipschitz_bound=9.0, **options)
 
 
 def values(path, points):
@@ -52,6 +53,8 @@ def test_what_others_cannot_read_is_refused(tmp_path, monkeypatch):
     pytest.importorskip("onnx")
     with pytest.raises(ConfigError, match="expected ReLU and clamps, received"):
         export_vnnlib(system(nn.Softplus), tmp_path)
+    with pytest.raises(ConfigError, match="float32 holds exactly"):
+        export_vnnlib(system(dtype=torch.float64), tmp_path)
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(MissingDependencyError, match="pip install onnx"):
         export_vnnlib(system(), tmp_path)

@@ -91,6 +91,13 @@ def test_a_rival_with_a_barrier_of_its_own_is_measured_on_it():
     assert nobody.measurements["safe_rollouts_leave"].note == "{B<=0} is empty"
 
 
+def test_no_number_is_an_error_of_either_kind():
+    true = kernel()
+    found = evaluate(Rival(lambda x: torch.where(x[:, 1] > 0, torch.nan, -true.interpolate(x))), pendulum(), SMALL, kernel=true)
+    assert min(found[name] for name in ("unsafe_called_safe", "safe_called_unsafe", "safe_rollouts_leave")) > 0.3
+    assert found["volume_over_kernel"] < 0.7
+
+
 def test_the_sets_are_counted_on_the_grid():
     true, env = kernel(), pendulum()
     found = evaluate(Rival(lambda x: x[:, 0].abs() - 1.2), env, SMALL, kernel=true)
@@ -279,3 +286,7 @@ def test_a_lipschitz_constant_is_certified_only_where_it_was_proved():
         lipschitz(out, agent, torch.Generator().manual_seed(0))
         assert out["lipschitz_certified"] == (agent.lipschitz_bound if proved else None)
         assert out["lipschitz_sampled"] <= agent.lipschitz_bound
+    agent.description["lipschitz"], agent.lipschitz_bound = {"proved": True}, 1.0
+    lipschitz(out, agent, torch.Generator().manual_seed(0))
+    assert out["lipschitz_certified"] is None
+    assert "refuted by a slope of" in out.measurements["lipschitz_certified"].note

@@ -28,6 +28,7 @@ from torchrl_sspl.experiments.description import describe, differences
 from torchrl_sspl.experiments.own_systems import advice
 from torchrl_sspl.experiments.run import Experiment, run_experiment
 from torchrl_sspl.modules import FrameEncoder
+from torchrl_sspl.modules.agent import agent_directory, load
 from torchrl_sspl.sets import UNLABELLED
 from torchrl_sspl.trainers.hooks import RestartHook
 from torchrl_sspl.trainers.stepper import SSPLStepper
@@ -444,6 +445,19 @@ def test_an_agent_is_not_measured_in_the_folder_of_a_run_that_was_trained(tmp_pa
     experiment = Experiment(compose(["env=pendulum", "agent=pendulum", "logger=none", f"out_dir={tmp_path}"]))
     with pytest.raises(OutputError, match="holds a run that was trained; give another out_dir"):
         experiment.run()
+
+
+def test_a_certificate_of_other_weights_is_not_shown(tmp_path):
+    agent = load("pendulum")
+    with torch.no_grad():
+        agent.policy.net[-1].weight.neg_()
+    agent.save(tmp_path / "other")
+    (tmp_path / "other" / "certificate.json").write_bytes((agent_directory("pendulum") / "certificate.json").read_bytes())
+    words = ["env=pendulum", f"agent={tmp_path / 'other'}", "logger=none", f"out_dir={tmp_path / 'run'}", "evaluation.episodes=0", "evaluation.grid=5", "evaluation.kernel_grid=21"]
+    with pytest.warns(UserWarning, match="proved of other weights"):
+        outcome = Experiment(compose(words)).run()
+    assert outcome.certificate is None
+    assert "the weights are not those that were certified" in " ".join(outcome.warnings)
 
 
 @pytest.mark.slow

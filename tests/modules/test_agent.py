@@ -29,6 +29,7 @@ from torchrl_sspl.modules.moments import MomentEncoder
 from torchrl_sspl.modules.networks import FrameEncoder, LatentDynamics, Policy
 from torchrl_sspl.modules.salad import SaLaD
 from torchrl_sspl.objectives import SSPLLoss
+from torchrl_sspl.runtime import Shield
 
 NETWORKS = {
     "encoder": {"class": "FrameEncoder", "arguments": {"latent_dim": 2, "image_size": 32}},
@@ -456,3 +457,36 @@ def test_a_barrier_that_would_be_read_as_another_one_is_not_saved(saved, tmp_pat
     with pytest.raises(ConfigError, match="as which its description would be read"):
         agent.save(tmp_path / "other")
     assert not (tmp_path / "other").exists()
+
+
+def test_what_was_proved_of_other_weights_is_not_proved(saved, tmp_path):
+    agent = make_agent(networks=NETWORKS, tolerated_error=0.1, lipschitz={"proved": True})
+    assert (agent.tolerated_error, agent.lipschitz_proved) == (0.1, True)
+    again = Agent.load(agent.save(tmp_path / "same"))
+    assert (again.tolerated_error, again.lipschitz_proved) == (0.1, True)
+    assert Agent.load(again.double().save(tmp_path / "double")).tolerated_error == 0.1  # the same numbers
+    with torch.no_grad():
+        agent.barrier[-1].weight.mul_(5.0)
+    with pytest.warns(UserWarning, match="proved of other weights"):
+        other = Agent.load(agent.save(tmp_path / "other"))
+    assert (other.tolerated_error, other.held_error, other.lipschitz_proved) == (0.0, 0.0, False)
+    with pytest.raises(ConfigError, match="one without"):
+        Shield(other)
+    other.tolerated_error = 0.05  # found anew; that its bound was proved is not known
+    assert (other.tolerated_error, other.lipschitz_proved) == (0.05, False)
+    found = Agent.load(other.save(tmp_path / "anew"))
+    assert (found.tolerated_error, found.lipschitz_proved) == (0.05, False)
+
+
+def test_a_description_of_another_agent_proves_nothing():
+    torch.manual_seed(1)
+    networks = FrameEncoder(2, 32), LatentDynamics(2, 1), SandwichBarrier(2, (8,), 1.5), Policy(2, 1)
+    first = Agent.from_networks(*networks)
+    first.tolerated_error = 0.1
+    assert Agent.from_networks(*networks, description=first.description).tolerated_error == 0.1
+    networks[3].net[-1].weight.data.neg_()
+    other = Agent.from_networks(*networks, description=first.description)
+    assert (other.tolerated_error, other.lipschitz_proved) == (0.0, True)  # the bound is proved each time
+    for wrong in (-0.1, float("nan"), "0.1"):
+        with pytest.raises(ConfigError, match="tolerated error that is finite"):
+            other.tolerated_error = wrong

@@ -297,7 +297,9 @@ def test_the_gain_travels_with_the_agent(tmp_path):
     changed = Agent(
         shipped.encoder, shipped.dynamics, shipped.barrier, shipped.policy, shipped.lipschitz_bound, shipped.description, 0.37
     )
-    assert torch.equal(Agent.load(changed.save(tmp_path / "agent")).gain, gain_matrix(0.37, shipped.latent_dim))
+    with pytest.warns(UserWarning, match="proved of other weights"):  # of the gain that was shipped
+        read = Agent.load(changed.save(tmp_path / "agent"))
+    assert torch.equal(read.gain, gain_matrix(0.37, shipped.latent_dim))
 
 
 @pytest.mark.parametrize("error", [-0.1, math.inf, math.nan, "0.1", True])

@@ -509,7 +509,7 @@ def _tolerated_changes(
     said, found = ([float(m.group()) for m in _NUMBER.finditer(s.detail)] for s in (a, b))
     if a.name == TOLERATED and any(limit < a.value for limit in said):
         return [(Reason.NUMBERS_CHANGED, f"{a.name}: claimed above its own refutation")]
-    if a.name != TOLERATED and any(x < 0.9 * y for x, y in zip(said, found, strict=True)):
+    if a.name != TOLERATED and any(x < y - 1.001 * 10.0 ** (math.floor(math.log10(y)) - 1) for x, y in zip(said, found, strict=True) if y > 0):  # of two digits the last
         return [(Reason.TEXT_CHANGED, f"{a.name}: detail not as computed")]
     if b.value is not None and a.value <= b.value * (1.0 + 1e-9):
         return []

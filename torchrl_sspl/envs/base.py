@@ -73,7 +73,8 @@ class SafetyEnv(EnvBase):
 
     A subclass gives the physics and the picture: ``dynamics``, ``wrap``, ``previous_state`` and ``draw``.
     What else is particular to it (names, units, requirements, another renderer, a full physics) are ``system``,
-    ``renderers``, ``known_twin`` and ``physics``, all with defaults. Output keys, for ``batch_size=[n]``:
+    ``renderers``, ``known_twin`` and ``physics``, all with defaults; where ``sample_states`` does not draw from all states, ``among``
+    names those in words, which certificates print. Output keys, for ``batch_size=[n]``:
 
     ========== ============================== ============================================================
     key        shape, dtype                   meaning
@@ -133,7 +134,7 @@ class SafetyEnv(EnvBase):
         self.state_dim, self.action_dim, self.max_action = state_dim, action_dim, float(max_action)
         self.safe_set, self.unsafe_set, self.state_space = safe_set, unsafe_set, state_space
         check_disjoint(safe_set, unsafe_set)
-        self.exit_region = exit_region
+        self.exit_region, self.among = exit_region, ""
         self.initial_set = state_space if initial_set is None else initial_set
         self.image_size, self.horizon = image_size, horizon
         set_specs(self, image_size, state_dim, self.action_high)
@@ -212,11 +213,6 @@ class SafetyEnv(EnvBase):
         codes = label(state, self.safe_set, self.unsafe_set)
         outside = ~self.state_space.contains(state)
         return torch.where(outside.unsqueeze(-1), torch.full_like(codes, self.exit_region), codes)
-
-    @property
-    def among(self) -> str:
-        """Which states :meth:`sample_states` draws, where these are not all; certificates say it."""
-        return ""
 
     def sample_states(
         self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None

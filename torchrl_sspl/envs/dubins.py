@@ -207,6 +207,7 @@ class DubinsEnv(SafetyEnv):
         )  # fmt: skip
         self.max_yaw_rate, self.speed, self.dt = float(max_yaw_rate), float(speed), float(dt)
         self.yaw_lag = None if yaw_lag is None else (float(yaw_lag[0]), float(yaw_lag[1]))
+        self.among = "" if yaw_lag is None else "of robots that were walking straight ahead before"
         self.obstacle_shape, self.obstacle_half_size = obstacle_shape, float(obstacle_half_size)
         self.obstacle_centre, self.arena_half_size = centre, float(arena_half_size)
         self.safe_half_size, self.unsafe_half_size = float(safe_half_size), float(unsafe_half_size)
@@ -322,11 +323,6 @@ class DubinsEnv(SafetyEnv):
         heading, step = state[..., 2:3], self.speed * self.dt
         before = state[..., :2] - step * torch.cat([heading.cos(), heading.sin()], -1)
         return torch.cat([before, heading, torch.zeros_like(state[..., 3:])], -1)
-
-    @property
-    def among(self) -> str:
-        """See ``SafetyEnv``."""
-        return "" if self.yaw_lag is None else "of robots that were walking straight ahead before"
 
     def sample_states(
         self, n: int, generator: torch.Generator | None = None, *, region: Region | None = None

@@ -7,6 +7,7 @@ import math
 import random
 import re
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from enum import IntEnum
@@ -439,7 +440,9 @@ def _verify(
     except CertificationError as error:
         raise _Stop(Exit.MALFORMED, f"FAILED {Reason.SCHEMA_UNKNOWN.name}: {error}") from error
     try:
-        agent = Agent.load(directory, trust=trust)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # that weights were changed is said here
+            agent = Agent.load(directory, trust=trust)
         _witness(agent)
     except CheckpointError as error:
         raise _Stop(Exit.AGENT, f"FAILED the agent cannot be read: {error}") from error
@@ -451,6 +454,8 @@ def _verify(
     if claimed.record is not None:
         again.layers |= _measured_layers(claimed.record, claimed, agent)
     found = differences(claimed, again, required=agent.tolerated_error) | _history(claimed, agent)
+    if agent.of_other_weights:
+        found = {Reason.WEIGHTS_CHANGED: "agent.json says what was proved of others"} | found
     _refuse(found)
     budget = Budget(seconds=seconds / 3)
 

@@ -242,21 +242,21 @@ class Agent(nn.Module):
 
         Set it to what :func:`~torchrl_sspl.evaluation.certify.premise` finds; a ConfigError for what is negative or not finite.
         """
-        return 0.0 if self._of_others else float(self.description.get("tolerated_error", 0.0))
+        return 0.0 if self.of_other_weights else float(self.description.get("tolerated_error", 0.0))
 
     @tolerated_error.setter
     def tolerated_error(self, error: float) -> None:
         _check_error(error)
-        if self._of_others:
+        if self.of_other_weights:
             self.description["lipschitz"] = {**self.description.get("lipschitz", {}), "proved": False, "reason": "proved of other weights"}
         self.description |= {"tolerated_error": error, "proof_of": self._proof_digest()}
-        self._of_others = False
+        self.of_other_weights = False
 
     @property
     def lipschitz_proved(self) -> bool:
         """Whether ``lipschitz_bound`` was proved of these weights, as the description says; ``sspl verify`` proves it anew."""
         said = self.description.get("lipschitz")
-        return isinstance(said, dict) and said.get("proved") is True and not self._of_others
+        return isinstance(said, dict) and said.get("proved") is True and not self.of_other_weights
 
     def _proof_digest(self) -> str:
         """Digest of what proofs are about: all but the encoder, as numbers of whatever type."""
@@ -264,9 +264,9 @@ class Agent(nn.Module):
         return weights_digest(state | {"lipschitz_bound": torch.tensor(self.lipschitz_bound, dtype=torch.float64)})
 
     def _tie(self) -> None:
-        """Finds out whether what the description says was proved is about these weights; where it does not say, it is."""
+        """Finds out whether what the description says was proved is about other weights; where it does not say, it is not."""
         claims = not self.description.keys().isdisjoint(("lipschitz", "tolerated_error"))
-        self._of_others = claims and self.description.setdefault("proof_of", digest := self._proof_digest()) != digest
+        self.of_other_weights = claims and self.description.setdefault("proof_of", digest := self._proof_digest()) != digest
 
     @property
     def held_error(self) -> float:
@@ -355,7 +355,7 @@ class Agent(nn.Module):
         agent.description.pop("proof_of", None)  # of the weights that it was built with
         agent.description |= {} if said is None else {"proof_of": said}
         agent._tie()
-        if agent._of_others:
+        if agent.of_other_weights:
             warnings.warn(
                 f"'{path}' says what was proved of other weights, so that it counts as not proved; set agent.tolerated_error = premise(agent), "
                 "save the agent and certify it", stacklevel=2,
