@@ -18,8 +18,18 @@ HOVERS = f"{FORGED}::test_a_barrier_that_hovers_hides_no_events"
 SPIKED = f"{LOOPS}::test_a_spike_in_u_makes_no_start_close"
 UNNAMED = f"{LOOPS}::test_seeds_that_only_the_certificate_names_measure_nothing"
 STEPS = f"{LOOPS}::test_events_are_those_of_every_single_step"
+AGENT, BESIDE = "torchrl_sspl/modules/agent.py", "torchrl_sspl/evaluation/beside.py"
+CONTROLLERS, KNOWN = "torchrl_sspl/evaluation/controllers.py", "torchrl_sspl/evaluation/known.py"
+FLAGS = "tests/modules/test_agent.py"
+BESIDES = f"{LOOPS}::test_a_certificate_is_shown_beside_its_own_agent_alone"
+NUMBERS = "tests/evaluation/test_known.py::test_no_number_is_an_error_of_either_kind"
 
-#: (file, old text, new text, tests[, why it survives])
+#: (file, old text, new text, tests[, why it survives])AGENT, BESIDE = "torchrl_sspl/modules/agent.py", "torchrl_sspl/evaluation/beside.py"
+CONTROLLERS, KNOWN = "torchrl_sspl/evaluation/controllers.py", "torchrl_sspl/evaluation/known.py"
+FLAGS = "tests/modules/test_agent.py"
+BESIDES = f"{LOOPS}::test_a_certificate_is_shown_beside_its_own_agent_alone"
+NUMBERS = "tests/evaluation/test_known.py::test_no_number_is_an_error_of_either_kind"
+
 MUTANTS = [
     # Seeds.
     (SEEDS, "PURPOSES[purpose] * _INDICES + index", "PURPOSES[purpose] + index", "tests/test_seeds.py"),
@@ -43,7 +53,7 @@ MUTANTS = [
     (STATISTICS, "events = min(total.events, n)", "events = min(total.left, n)", TWINS),
     (STATISTICS, "of {m}; at most\", min(total.mistaken, m)", "of {m}; at most\", 0", TWINS),
     (STATISTICS, "clash = any(used_before(seed, used) or", "clash = any(", TWINS),
-    (STATISTICS, "any(drawn_for(seed, root) not in own for root in used)", "False", TWINS),
+    (STATISTICS, "any(drawn_for(seed, root) not in own for root in used)", "False", f"{LOOPS}::test_seeds_of_the_training_are_found"),
     (STATISTICS, "fails = found > REPEATED * n", "fails = False", TWINS),
     (STATISTICS, "total.undefined, total.episodes,\n         Reason", "0, total.episodes,\n         Reason", TWINS),
     (STATISTICS, "total.outside, total.seen, Reason", "0, total.seen, Reason", TWINS),
@@ -129,6 +139,17 @@ MUTANTS = [
     (BLOCKS, "looks = torch.minimum(barrier, both.seen)", "looks = barrier", f"{LOOPS}::test_a_picture_of_u_that_looks_safe_counts_though_the_memory_knows_better"),
     (CERTIFY, "if agent.tolerated_error and claimed.level:", "if claimed.level > 0:", f"{LOOPS}::test_an_agent_that_tolerates_errors_is_certified_at_the_level_that_it_keeps"),
     (CERTIFY, "if measure and not blocks:", "if False:", f"{LOOPS}::test_measuring_all_again_fails_where_nothing_can_be_measured"),
+    (AGENT, "return 0.0 if self.of_other_weights else", "return", FLAGS),
+    (AGENT, "if before not in (None, agent.description[\"proof_of\"]):", "if False:", FLAGS),
+    (AGENT, "and not self.of_other_weights", "", FLAGS),
+    (BESIDE, "if said != now:", "if False:", BESIDES),
+    (BESIDE, "(Reason.WEIGHTS_CHANGED, found.weights, weights_digest(agent.state_dict())),", "", BESIDES),
+    (CERTIFY, "if record is None or before.weights == weights_digest(agent.state_dict()):", "if True:", f"{LOOPS}::test_an_agent_that_was_changed_is_measured_on_other_episodes"),
+    (CERTIFY, "record.among != env.among", "False", f"{LOOPS}::test_which_states_are_drawn_is_said_and_compared"),
+    (CONTROLLERS, "outside = ~(encoded.abs() <= 1.0).all(1)", "outside = ~(latent.abs() <= 1.0).all(1)", f"{LOOPS}::test_latents_outside_the_domain_are_counted_before_the_memory_cuts_them"),
+    (KNOWN, "out.count(names[1], ~(safe_barrier <= 0)", "out.count(names[1], safe_barrier > 0", NUMBERS),
+    (KNOWN, "~(in_unsafe > 0)", "in_unsafe <= 0", NUMBERS),
+    (KNOWN, "(~(barrier <= 0)).any(0)", "(barrier > 0).any(0)", NUMBERS),
     (CERTIFY, "measure, trust, seconds, say)", "measure, trust or bool(measure), seconds, say)", f"{TWINS}::test_a_certificate_of_networks_that_run_code_is_checked_on_request_alone"),
     (CERTIFY, "Agent.load(directory, trust=trust)", "Agent.load(directory)", f"{TWINS}::test_a_certificate_of_networks_that_run_code_is_checked_on_request_alone"),
     (BLOCKS, "int((shown & ~(looks > level - m)).any(0).sum())", "0", f"{LOOPS}::test_resets_show_what_the_camera_hides"),

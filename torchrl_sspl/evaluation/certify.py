@@ -536,7 +536,7 @@ def _measured_again(
     kind: Any = StateBlocks if record.kind == "states" else ResetBlocks
     if (record.kind == "states") != isinstance(env, SafetyEnv):
         raise _Stop(Exit.REFUSED, f"FAILED {Reason.RECORD_CHANGED.name}: the episodes are of another kind of system")
-    if record.kind == "states" and record.among != env.among:
+    if isinstance(env, SafetyEnv) and record.among != env.among:
         _refuse({Reason.RECORD_CHANGED: f"claimed of states {record.among!r}, the system draws states {env.among!r}"})
     source = kind(agent, env, record, claimed.level, _tolerated(claimed, agent))
     order, began = list(range(len(record.blocks))), time.monotonic()

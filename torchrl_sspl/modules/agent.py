@@ -99,6 +99,7 @@ class Agent(nn.Module):
     """
 
     gain: Tensor
+    of_other_weights: bool  # whether what the description says was proved is about others
 
     def __init__(
         self,
@@ -264,7 +265,7 @@ class Agent(nn.Module):
         return weights_digest(state | {"lipschitz_bound": torch.tensor(self.lipschitz_bound, dtype=torch.float64)})
 
     def _tie(self) -> None:
-        """Finds out whether what the description says was proved is about other weights; where it does not say, it is not."""
+        """Compares the weights with those of which the description says something was proved; where it does not say, they are these."""
         claims = not self.description.keys().isdisjoint(("lipschitz", "tolerated_error"))
         self.of_other_weights = claims and self.description.setdefault("proof_of", digest := self._proof_digest()) != digest
 
