@@ -174,7 +174,7 @@ def test_what_is_finished_is_not_run_again(command):
 def test_agents_of_one_name_in_two_folders_are_two_settings(tmp_path):
     config = compose(["env=pendulum", f"agent={tmp_path}/x/best", f"out_dir={tmp_path}/run"])
     tasks = [Task(folder, replace(config, agent=f"{tmp_path}/{folder}/best"), []) for folder in ("x", "y")]
-    agent = SimpleNamespace(description={})
+    agent = SimpleNamespace(description={}, lipschitz_proved=False)
     write_metrics(Outcome(tmp_path / "run", agent, config, None, {"own": Evaluation()}))
     assert [task.finished for task in tasks] == [True, False]
     text = (tmp_path / "run" / "metrics.json").read_text()
