@@ -37,6 +37,7 @@ PURPOSES = {
 }
 _INDICES = 1 << 24
 _MASK = 0xFFFF_FFFF
+_FACTORS = (0x85EBCA6B, 0xC2B2AE35)  # odd
 _LOOKED_FOR = 4096  # indices of a purpose; a seed of another run is one of them by a chance of one in fifty thousand
 
 
@@ -62,12 +63,16 @@ def spawn(seed: int, purpose: str, index: int = 0) -> int:
         )
     if not 0 <= index < _INDICES or seed < 0:
         raise ConfigError(f"expected a seed >= 0 and an index in [0, {_INDICES}), received seed={seed}, index={index}")
-    start = int(np.random.SeedSequence(seed).generate_state(1)[0])
-    x = (start + PURPOSES[purpose] * _INDICES + index) & _MASK
+    x = (_start(seed) + PURPOSES[purpose] * _INDICES + index) & _MASK
     # Bijections of 32 bits: multiplications by odd numbers, and exclusive ors with a shift of at least half.
-    x = ((x ^ (x >> 16)) * 0x85EBCA6B) & _MASK
-    x = ((x ^ (x >> 16)) * 0xC2B2AE35) & _MASK
+    for factor in _FACTORS:
+        x = ((x ^ (x >> 16)) * factor) & _MASK
     return x ^ (x >> 16)
+
+
+def _start(seed: int) -> int:
+    """Where the numbers of a run begin."""
+    return int(np.random.SeedSequence(seed).generate_state(1)[0])
 
 
 def drawn_for(seed: int, root: int) -> str:
@@ -82,9 +87,9 @@ def drawn_for(seed: int, root: int) -> str:
     if root < 0:
         return ""
     x = seed & _MASK
-    for factor in (0xC2B2AE35, 0x85EBCA6B):
+    for factor in reversed(_FACTORS):
         x = ((x ^ (x >> 16)) * pow(factor, -1, 1 << 32)) & _MASK
-    x = (x ^ (x >> 16)) - int(np.random.SeedSequence(root).generate_state(1)[0]) & _MASK
+    x = ((x ^ (x >> 16)) - _start(root)) & _MASK
     named = {number: purpose for purpose, number in PURPOSES.items()}
     return named.get(x // _INDICES, "") if x % _INDICES < _LOOKED_FOR else ""
 

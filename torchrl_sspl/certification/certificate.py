@@ -509,7 +509,7 @@ def _tolerated_changes(
     said, found = ([float(m.group()) for m in _NUMBER.finditer(s.detail)] for s in (a, b))
     if a.name == TOLERATED and any(limit < a.value for limit in said):
         return [(Reason.NUMBERS_CHANGED, f"{a.name}: claimed above its own refutation")]
-    if a.name != TOLERATED and any(x < y - 1.001 * 10.0 ** (math.floor(math.log10(y)) - 1) for x, y in zip(said, found, strict=True) if y > 0):  # of two digits the last
+    if a.name != TOLERATED and any(x < y - 1.001 * _last_digit(y) for x, y in zip(said, found, strict=True) if y > 0):
         return [(Reason.TEXT_CHANGED, f"{a.name}: detail not as computed")]
     if b.value is not None and a.value <= b.value * (1.0 + 1e-9):
         return []
@@ -519,6 +519,11 @@ def _tolerated_changes(
     if proved is None and confirm is not None:
         return [(Reason.UNDECIDED, f"{a.name}: {a.value:.6g} not decided again in the time")]
     return [(Reason.NUMBERS_CHANGED, numbers)]
+
+
+def _last_digit(number: float) -> float:
+    """One in the last place of a number that is written with two digits."""
+    return 10.0 ** (math.floor(math.log10(number)) - 1)
 
 
 def _number(value: float | None) -> str:

@@ -153,10 +153,11 @@ def statistical_layer(record: Record, *, names_seeds: bool = True) -> Layer:
     )
     _share(layer, "episodes", text, events, n, each, record.acceptable, reason, detail)
     if record.kind == "states":
+        among = f", {record.among}" if record.among else ""
         uniform = min(sum(n - n // 2 for n in map(record.size, range(len(record.blocks)))), total.shown)
         what = f"observations of U with B <= s, {uniform} drawn uniformly in U and {total.shown - uniform} where one step under a random "
-        what += "action enters it" + (f", {record.among}" if record.among else "")
-        started = "uniformly (in a union: in equal shares of its parts) in the states whose observation lies in the set" + (f", {record.among}" if record.among else "")
+        what += f"action enters it{among}"
+        started = f"uniformly (in a union: in equal shares of its parts) in the states whose observation lies in the set{among}"
     else:
         what = "episodes with an observation of U that show one with B <= s, half under the policy, half under random "
         what += "actions"

@@ -334,7 +334,7 @@ class Agent(nn.Module):
             bound, nets = float(body.pop("lipschitz_bound")), body["networks"]
             kinds = (ENCODERS, "encoder"), (DYNAMICS, "dynamics"), (POLICIES, "policy")
             encoder, dynamics, policy = (_build(role, registry, nets[role], trust) for registry, role in kinds)
-            said = body.pop("proof_of", None)
+            told = "proof_of" in body
             agent = cls(encoder, dynamics, mlp_barrier(**nets["barrier"]), policy, bound, body)
             weights = load_file(path / WEIGHTS_FILE)
             if any(w.dtype == torch.float64 for w in weights.values()):
@@ -353,8 +353,8 @@ class Agent(nn.Module):
                 raise CheckpointError(
                     f"expected finite weights in '{path}', received NaN or infinity in '{name}'; restore the files"
                 )
-        agent.description.pop("proof_of", None)  # of the weights that it was built with
-        agent.description |= {} if said is None else {"proof_of": said}
+        if not told:
+            agent.description.pop("proof_of", None)  # of the weights that it was built with
         agent._tie()
         if agent.of_other_weights:
             warnings.warn(
