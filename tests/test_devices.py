@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from functools import partial
 
 import pytest
 import torch
@@ -66,3 +67,10 @@ def test_each_module_has_a_graph_of_its_own():
     x = torch.tensor([[-1.0, 2.0]])
     for answer in (nn.ReLU(), nn.Tanh(), nn.Linear(2, 2), nn.Linear(2, 2)):
         assert torch.allclose(compiled(nn.Sequential(answer).forward)(x), answer(x))
+
+
+def test_beyond_the_shapes_that_graphs_are_kept_for_nothing_stops(monkeypatch):
+    monkeypatch.setattr(torch, "compile", partial(torch.compile, backend="eager"))
+    double = compiled(lambda x: 2 * x)
+    for n in range(1, 12):
+        assert torch.equal(double(torch.ones(n)), 2 * torch.ones(n))

@@ -35,6 +35,7 @@ def usable_device(name: torch.device | str) -> torch.device:
 def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     """A Python function or method of tensors as one graph for the shapes it is called with; the first call compiles, for up to half a minute.
 
+    Beyond the eight shapes that torch keeps graphs for, calls run without one.
     What it takes from frozen modules must not change afterwards. When called, a MissingDependencyError if this machine has no
     compiler for it. Source: none.
 
@@ -54,8 +55,10 @@ def compiled(function: Callable[..., Any]) -> Callable[..., Any]:
     def call(*given: Any) -> Any:
         try:
             return graph(*given)
-        except RuntimeError as error:
-            if "compiler" not in str(error).lower():
+        except Exception as error:
+            if type(error).__name__ == "FailOnRecompileLimitHit":  # a loop that runs must not stop for it
+                return function(*given)
+            if not isinstance(error, RuntimeError) or "compiler" not in str(error).lower():
                 raise
             raise MissingDependencyError(
                 f"compile=True needs a C++ compiler such as g++, received: {str(error).splitlines()[0][:200]}; install one, or leave it out"

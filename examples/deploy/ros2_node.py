@@ -24,19 +24,23 @@ class SafeAgentNode(Node):
     def __init__(self, path: Path) -> None:
         super().__init__("sspl_agent")
         self.agent = OnnxAgent(path)
+        self.taken: np.ndarray | None = None  # the last command
         self.actions = self.create_publisher(Float32MultiArray, "/cmd", 1)
         self.verdicts = self.create_publisher(String, "/verdict", 1)
         self.create_subscription(Image, "/camera/image_raw", self.on_image, 1)
 
     def on_image(self, message: Image) -> None:
         """One step of the agent."""
-        if message.encoding != "rgb8":
+        frame, stamp = None, message.header.stamp
+        if message.encoding == "rgb8":
+            frame = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)[:, : 3 * message.width]
+            frame = frame.reshape(message.height, message.width, 3)
+        else:
             self.get_logger().error(f"expected rgb8, received {message.encoding}")
-            return
-        frame = np.frombuffer(message.data, np.uint8).reshape(message.height, message.step)[:, : 3 * message.width]
-        action, verdict, _ = self.agent.step(frame.reshape(message.height, message.width, 3))
+        # A frame that the queue of one has dropped shows in the time of the next.
+        action, verdict, _ = self.agent.step(frame, self.taken, stamp.sec + 1e-9 * stamp.nanosec)
         taken = action if verdict == "proof applies" else np.zeros_like(action)
-        self.agent.action = taken[None]
+        self.taken = taken
         self.actions.publish(Float32MultiArray(data=taken.tolist()))
         self.verdicts.publish(String(data=verdict))
 

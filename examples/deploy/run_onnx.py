@@ -34,16 +34,30 @@ class OnnxAgent:
         self.session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
         about = {k: json.loads(v) for k, v in self.session.get_modelmeta().custom_metadata_map.items()}
         self.shape = tuple(about["pixels"])
+        self.period = about.get("dt")
         self.action = np.zeros((1, len(about["action_scale"])), np.float32)
         self.latent = np.zeros((1, about["latent_dim"]), np.float32)
         self.reset()
 
     def reset(self) -> None:
         """Begin an episode: what was expected is forgotten."""
-        self.begins, self.applies, self.before = True, True, None
+        self.begins, self.applies, self.before, self.time = True, True, None, None
 
-    def step(self, frame: NDArray[np.uint8], taken: NDArray[np.float32] | None = None) -> tuple[NDArray[np.float32], str, float]:
-        """Action ``(m,)``, verdict and barrier value for a frame ``(H, W, 3)``; ``taken`` is what was really done since the last one."""
+    def step(
+        self, frame: NDArray[np.uint8] | None, taken: NDArray[np.float32] | None = None, time: float | None = None
+    ) -> tuple[NDArray[np.float32], str, float]:
+        """Action ``(m,)``, verdict and barrier value for a frame ``(H, W, 3)``, or for None where none came.
+
+        ``taken`` is what was really done since the last one, where it was not the action that was told; the proof says nothing of it.
+        ``time`` is when the frame was taken, in s: after a gap of other than one period, as where a frame was lost, two frames do not show
+        what the agent was trained on, and the proof no longer applies.
+        """
+        late = None not in (time, self.time, self.period) and abs(time - self.time - self.period) > 0.5 * self.period
+        self.time = self.time if time is None else time
+        if frame is None or late:
+            self.applies, self.before, self.begins = False, None, True
+        if frame is None:
+            return np.zeros_like(self.action[0]), "no picture", float("nan")
         if frame.dtype != np.uint8 or frame.shape != (*self.shape[1:], 3):
             raise ValueError(f"expected a frame {(*self.shape[1:], 3)} of uint8, received {frame.shape} of {frame.dtype}")
         now, before = frame.transpose(2, 0, 1), self.before
@@ -52,6 +66,7 @@ class OnnxAgent:
             return np.zeros_like(self.action[0]), "waiting for a second frame", float("nan")
         pixels = np.concatenate([before, now])[None]
         action = self.action if taken is None else np.asarray(taken, np.float32)[None]
+        self.applies = self.applies and bool(np.array_equal(action, self.action) or self.begins)
         given = {"pixels": pixels, "latent": self.latent, "action": action, "begins": np.array([self.begins])}
         self.action, barrier, _, _, met, self.latent = self.session.run(None, given)
         self.begins = False

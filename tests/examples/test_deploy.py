@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -32,3 +33,37 @@ def test_a_process_without_torch_runs_a_film(tmp_path):
     lines = done.stdout.splitlines()
     assert "waiting" in lines[0]
     assert all("B = " in line and ("proof applies" in line or "premise" in line or "outside" in line) for line in lines[1:])
+
+
+class _Session:
+    """Meets the premise, and tells what it was given."""
+
+    def __init__(self) -> None:
+        self.given: list[dict] = []
+
+    def run(self, _names, given):
+        self.given.append(given)
+        one = np.zeros(1, np.float32)
+        return np.full((1, 1), 0.5, np.float32), one - 1, one - 1, one, np.array([True]), np.zeros((1, 3), np.float32)
+
+
+def test_a_lost_frame_ends_the_proof():
+    pytest.importorskip("onnxruntime")
+    kind = runpy.run_path(str(DEPLOY / "run_onnx.py"))["OnnxAgent"]
+    agent, frame = object.__new__(kind), np.zeros((8, 8, 3), np.uint8)
+    agent.session, agent.shape, agent.period = _Session(), (6, 8, 8), 0.05
+    agent.action, agent.latent = np.zeros((1, 1), np.float32), np.zeros((1, 3), np.float32)
+
+    def told(*steps):
+        agent.reset()
+        return [agent.step(given, taken, time)[1] for given, taken, time in steps]
+
+    first = ((frame, None, 0.0), (frame, None, 0.05))
+    assert told(*first, (frame, None, 0.1)) == ["waiting for a second frame", "proof applies", "proof applies"]
+    assert told(*first, (None, None, None), (frame, None, 0.15), (frame, None, 0.2))[2:] == [
+        "no picture", "waiting for a second frame", "inside, premise not met"
+    ]  # fmt: skip
+    assert told(*first, (frame, None, 0.15), (frame, None, 0.2))[2:] == ["waiting for a second frame", "inside, premise not met"]
+    assert agent.session.given[-1]["begins"]  # what was expected is too old
+    assert told(*first, (frame, np.float32([0.5]), 0.1))[-1] == "proof applies"  # what was told
+    assert told(*first, (frame, np.float32([0.7]), 0.1))[-1] == "inside, premise not met"

@@ -356,7 +356,7 @@ class Policy(nn.Module):
 if __name__ == "__main__":
     from torchrl_sspl.lipschitz import SandwichBarrier
     from torchrl_sspl.modules import LatentDynamics
-    from torchrl_sspl.modules.agent import Agent
+    from torchrl_sspl.modules.agent import Agent, load
 
     nets = Outer.Encoder(2), LatentDynamics(2, 1, (8,)), SandwichBarrier(2, (8,)), Policy(2)
     agent = Agent.from_networks(*nets)
@@ -490,3 +490,17 @@ def test_a_description_of_another_agent_proves_nothing():
     for wrong in (-0.1, float("nan"), "0.1"):
         with pytest.raises(ConfigError, match="tolerated error that is finite"):
             other.tolerated_error = wrong
+
+
+def test_weights_that_change_lose_what_was_proved_of_them_at_once():
+    first, other = sspl.load("pendulum"), sspl.load("pendulum")
+    with torch.no_grad():
+        other.barrier[-1].bias.sub_(1.0)
+    assert (other.tolerated_error, other.held_error, other.lipschitz_proved, other.of_other_weights) == (0.0, 0.0, False, True)
+    first.load_state_dict(other.state_dict())
+    assert first.of_other_weights
+    rounded = sspl.load("pendulum").bfloat16()
+    assert rounded.tolerated_error == 0.0
+    with pytest.raises(ConfigError, match="one without"):
+        Shield(rounded)
+    assert sspl.load("pendulum").double().tolerated_error > 0.0  # the same numbers

@@ -12,7 +12,7 @@ import torch
 from torchrl_sspl.envs import PendulumEnv
 from torchrl_sspl.errors import CertificationError, ConfigError
 from torchrl_sspl.modules.agent import load
-from torchrl_sspl.modules.export import INPUTS, OUTPUTS, DeployedStep, _about, _compare, _steps
+from torchrl_sspl.modules.export import INPUTS, OUTPUTS, DeployedStep, _about, _compare, _drawn, _steps
 from torchrl_sspl.modules.observer import corrected
 
 
@@ -163,3 +163,13 @@ def test_pictures_have_the_size_that_is_asked_for_where_the_encoder_takes_any(tm
 def test_another_suffix_is_refused(tmp_path):
     with pytest.raises(ConfigError, match=r"\.onnx or \.pt2"):
         load("pendulum").export(tmp_path / "agent.pth")
+
+
+@pytest.mark.parametrize("name", ["pendulum", "quadruped"])
+def test_the_pictures_that_a_file_is_compared_on_lie_on_both_sides(name):
+    agent = load(name)
+    pictures = _drawn(agent, 64, 1)
+    inside = agent.barrier(agent.encode(pictures)) <= 0.0
+    assert 4 < int(inside.sum()) < 60
+    agent.description = {}
+    assert _drawn(agent, 64, 1) is None

@@ -197,6 +197,7 @@ def test_the_same_corrections_are_cut_in_a_collector_and_in_a_controller():
     agent = small_agent(error=0.01)
     with torch.no_grad():
         agent.barrier[-1].bias.add_(-agent.barrier(agent.encode(frames(64)))[:, 0].median())
+    agent.tolerated_error = 0.01  # of the barrier as it is now
     observer = LatentObserver(agent.encoder, agent.gain, agent.latent_dim, agent.barrier, agent.held_error)
     prior, seen = agent.encode(frames(64)), agent.encode(frames(64, 1))
     memory = Memory(agent)
@@ -391,3 +392,30 @@ def test_an_agent_in_float64_runs():
     controller = agent.controller()
     assert controller.step(None).latent.dtype == torch.float64
     assert controller.step(torch.zeros(1, 6, 64, 64, dtype=torch.uint8)).action.dtype == torch.float64
+
+
+def test_the_proof_ends_with_actions_that_nobody_has_checked():
+    agent = small_agent(error=0.01)
+    agent.barrier[-1].bias.data.sub_(100.0)  # everything is inside
+    agent.tolerated_error = 0.01
+    controller = agent.controller(3)
+    out = controller.step(frames(3))
+    assert out.applies.all()
+    assert controller.took(out.action).all()  # its own
+    other = out.action.clone()
+    other[1] += 1e-6
+    checked = agent.dynamics(out.latent, other)
+    assert controller.took(other, checked).all()  # a filter's
+    assert controller.took(other).tolist() == [True, False, True]
+    again = controller.step(frames(3, 1))
+    assert again.applies.tolist() == [True, False, True]
+    controller.reset(torch.tensor([1]))
+    again.action[1] += 1.0
+    assert controller.took(again.action).all()  # row 1 was of an episode that is over
+    assert controller.step(frames(3)).applies.all()
+
+
+def test_a_gain_of_float64_is_not_rounded():
+    third = torch.eye(2, dtype=torch.float64) / 3
+    assert torch.equal(gain_matrix(third, 2), third)
+    assert gain_matrix(torch.eye(2, dtype=torch.int64), 2).dtype == torch.float32

@@ -432,3 +432,18 @@ def test_vectorised_environments_that_do_not_fit_are_refused():
         envs.step(np.zeros((1, 1)))
     with pytest.raises(ConfigError, match="reset_mask"):
         envs.reset(options={"reset_mask": np.array([True])})
+
+
+def test_an_environment_that_begins_episodes_without_a_word_is_refused():
+    env = gymnasium.wrappers.Autoreset(Gym())
+    with pytest.raises(ConfigError, match="put Autoreset around"):
+        SafetyWrapper(gymnasium.wrappers.TimeLimit(env, 10), load("pendulum"))
+
+
+def test_the_filter_takes_an_agent_of_float64():
+    protect = SafetyFilter(load("pendulum").double())
+    given = TensorDict({
+        "pixels": torch.zeros(2, 6, 64, 64, dtype=torch.uint8), "action": torch.ones(2, 1), "prior": torch.zeros(2, 3, dtype=torch.float64),
+        "is_init": torch.ones(2, 1, dtype=torch.bool),
+    }, [2])  # fmt: skip
+    assert protect(given)["latent"].dtype == torch.float64

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from torchrl_sspl.envs import GymnasiumPixels, PendulumEnv
-from torchrl_sspl.errors import CheckpointError, ConfigError, OutputError, ShapeError
+from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, OutputError, ShapeError
 from torchrl_sspl.evaluation import simulate
 from torchrl_sspl.evaluation.controllers import as_controller
 from torchrl_sspl.modules.agent import load
@@ -334,3 +334,66 @@ def test_a_size_that_changes_is_an_alarm_where_the_encoder_takes_any():
     monitor.agent.encoder.image_size = None
     monitor.step(torch.zeros(1, 6, 64, 64, dtype=torch.uint8))
     assert monitor.step(torch.zeros(1, 6, 128, 128, dtype=torch.uint8)).reasons == [["size"]]
+
+
+def test_what_others_do_is_not_what_was_proved():
+    monitor = Monitor.load("pendulum")
+    out = monitor.step(shown()[0])
+    assert monitor.took(out.action).tolist() == [True]
+    assert monitor.took(out.action + 1.0).tolist() == [False]
+    assert names(monitor.step(shown(1, 2)[1]).verdict) == ["INSIDE"]
+
+
+@pytest.mark.parametrize(("options", "time"), [({}, 0.0), ({"period": 0.05}, None)])
+def test_a_time_and_a_period_go_together(options, time):
+    monitor = Monitor.load("pendulum", **options)
+    with pytest.raises(ConfigError, match="period=dt"):
+        monitor.step(shown()[0], time=time)
+    if options:
+        assert monitor.step(None).reasons == [["missing"]]
+
+
+def test_a_step_that_is_refused_leaves_the_time_as_it_was():
+    monitor = Monitor.load("pendulum", period=0.05)
+    monitor.step(shown()[0], time=0.0)
+    with pytest.raises(ShapeError):
+        monitor.step(shown(2)[0], time=0.05)
+    assert monitor.step(shown(1, 2)[1], time=0.05).reasons == [[]]
+
+
+def test_a_calibration_of_other_weights_is_refused():
+    agent, calibration = load("pendulum"), Monitor.load("pendulum").calibration
+    Monitor(agent.double(), calibration)  # the same numbers
+    with torch.no_grad():
+        agent.barrier[-1].bias.sub_(0.1)
+    with pytest.raises(CheckpointError, match="other weights"):
+        Monitor(agent, calibration)
+
+
+def test_an_agent_of_float64_is_watched_as_one_of_float32():
+    one, other = Monitor.load("pendulum"), Monitor.load("pendulum")
+    other = Monitor(other.agent.double(), other.calibration)
+    for pixels in shown(1, 3):
+        a, b = one.step(pixels), other.step(pixels)
+        assert torch.equal(a.verdict, b.verdict)
+        assert b.action.dtype == torch.float64
+        torch.testing.assert_close(b.signals["place"].float(), a.signals["place"], atol=1e-5, rtol=1e-5)
+
+
+def test_what_is_no_picture_and_no_row_is_refused():
+    monitor = Monitor.load("pendulum")
+    with pytest.raises(DTypeError, match="received list"):
+        monitor.step([1, 2])
+    with pytest.raises(ShapeError, match="rows of 1 systems"):
+        monitor.reset(torch.tensor([7]))
+
+
+def test_a_camera_keeps_frames_of_another_time_alone():
+    clean = torch.zeros(1, 6, 8, 8, dtype=torch.uint8)
+    kept = {}
+    for name in ("dark", "delayed"):
+        camera = CameraFault(name, 1.0, onset=0)
+        for t in range(5):
+            camera(clean, t)
+        kept[name] = len(camera.history)
+    assert kept == {"dark": 0, "delayed": 5}

@@ -108,7 +108,7 @@ def test_a_film_is_watched_and_a_black_one_is_an_alarm_with_its_number(tmp_path)
     wide = np.pad(np.kron(frame, np.ones((2, 2, 1), np.uint8)), ((0, 0), (32, 32), (0, 0)), constant_values=255)
     _, events, counts = seen(video=film(tmp_path / "still.mp4", [wide] * 6), steps=None)
     assert counts["steps"] == 5  # pairs of frames
-    assert events[0]["verdict"] in ("PROOF_APPLIES", "UNKNOWN_PICTURE")  # a codec changes textures
+    assert events[0]["verdict"] in ("INSIDE", "UNKNOWN_PICTURE")  # a codec changes textures; nobody knows what acts
     assert events[0]["barrier"] < 0
     assert events[0]["unsafe"] is None
     _, events, counts = seen(video=film(tmp_path / "black.mp4", [0 * wide] * 6), steps=None)
@@ -236,3 +236,11 @@ def test_an_agent_without_a_proof_is_said_to_have_none(monkeypatch):
     _, events, _ = seen(steps=3)
     assert {e["verdict"] for e in events} == {"INSIDE"}
     assert all("nothing is proved of this agent" in e["why"] for e in events)
+
+
+def test_under_random_actions_no_proof_applies_but_behind_the_filter():
+    _, bare, _ = seen(policy="random", steps=4)
+    assert {e["verdict"] for e in bare} <= {"INSIDE", "OUTSIDE"}
+    assert "nothing is proved of what acts here" in bare[0]["why"]
+    _, kept, _ = seen(policy="random", steps=4, protect=True)
+    assert {e["verdict"] for e in kept} == {"PROOF_APPLIES"}

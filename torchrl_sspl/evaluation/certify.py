@@ -582,6 +582,9 @@ def _print(claimed: Certificate, agent: Agent, unmeasured: str, blocks: int, rep
     report(f"OK: the weights are {claimed.weights[:12]}..., and the certificate says what they prove")
     if unmeasured and claimed.record is not None:
         report("What is printed as claimed was not checked again; that its words and bounds follow from its counts was")
+    absent = [name for name in ("deterministic", "statistical", "run-time") if name not in claimed.layers]
+    if absent:
+        report(f"It says nothing of these layers: {', '.join(absent)}")
     open_layers = [layer.name for layer in claimed.layers.values() if not layer.holds]
     if open_layers:
         report(f"What it says is that these layers are not certified: {', '.join(open_layers)}")

@@ -40,6 +40,7 @@ from torchrl_sspl.modules.shapes import ShapeBearingEncoder, ShapeEncoder, Shape
 WEIGHTS_FILE = "agent.safetensors"
 DESCRIPTION_FILE = "agent.json"
 FORMAT_VERSION = 1
+_CLAIMS = frozenset({"lipschitz", "tolerated_error"})  # what a description says was proved
 _HELD = 9  # values of what a memory may hold, per entry
 
 
@@ -99,7 +100,6 @@ class Agent(nn.Module):
     """
 
     gain: Tensor
-    of_other_weights: bool  # whether what the description says was proved is about others
 
     def __init__(
         self,
@@ -126,11 +126,8 @@ class Agent(nn.Module):
         if not 0.0 < self.lipschitz_bound < math.inf:
             raise ConfigError(f"expected a Lipschitz bound that is finite and above zero, received {lipschitz_bound}")
         self.description: dict[str, Any] = dict(description or {})
-        matrix = gain_matrix(gain, self.latent_dim)
-        if isinstance(gain, Tensor) and gain.ndim == 2:  # a matrix is not rounded to float32 in between
-            matrix = gain.detach().cpu().clone()
         first: Any = self.barrier[0]
-        self.register_buffer("gain", matrix.to(first.weight.dtype))
+        self.register_buffer("gain", gain_matrix(gain, self.latent_dim).to(first.weight.dtype))
         _check_error(self.description.get("tolerated_error", 0.0))
         self.eval()
         self.requires_grad_(False)
@@ -251,7 +248,6 @@ class Agent(nn.Module):
         if self.of_other_weights:
             self.description["lipschitz"] = {**self.description.get("lipschitz", {}), "proved": False, "reason": "proved of other weights"}
         self.description |= {"tolerated_error": error, "proof_of": self._proof_digest()}
-        self.of_other_weights = False
 
     @property
     def lipschitz_proved(self) -> bool:
@@ -259,15 +255,20 @@ class Agent(nn.Module):
         said = self.description.get("lipschitz")
         return isinstance(said, dict) and said.get("proved") is True and not self.of_other_weights
 
+    @property
+    def of_other_weights(self) -> bool:
+        """Whether what the description says was proved is about weights, or a gain, that these are not, or no longer; looked at anew each time."""
+        return bool(_CLAIMS & self.description.keys()) and self.description.get("proof_of") not in (None, self._proof_digest())
+
     def _proof_digest(self) -> str:
         """Digest of what proofs are about: all but the encoder, as numbers of whatever type."""
         state = {name: value.double() for name, value in self.state_dict().items() if not name.startswith("encoder.")}
         return weights_digest(state | {"lipschitz_bound": torch.tensor(self.lipschitz_bound, dtype=torch.float64)})
 
     def _tie(self) -> None:
-        """Compares the weights with those of which the description says something was proved; where it does not say, they are these."""
-        claims = not self.description.keys().isdisjoint(("lipschitz", "tolerated_error"))
-        self.of_other_weights = claims and self.description.setdefault("proof_of", digest := self._proof_digest()) != digest
+        """Where the description does not say of which weights something was proved, it is these."""
+        if _CLAIMS & self.description.keys():
+            self.description.setdefault("proof_of", self._proof_digest())
 
     @property
     def held_error(self) -> float:

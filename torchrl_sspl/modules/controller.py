@@ -126,7 +126,7 @@ class Step:
     inside: Tensor  # (n,) bool
     innovation: Tensor  # (n,) distance of what is seen from what was expected, latent units
     error: Tensor  # (n,) of it, what entered the closed loop: distance of the latent from what was expected
-    applies: Tensor  # (n,) bool, whether the premise of the proof has held at every step since the reset
+    applies: Tensor  # (n,) bool, whether the premise of the proof has held at every step since the reset, under actions that keep it
     latent: Tensor  # (n, p)
     seen: Tensor  # (n, p) of the observation by itself
 
@@ -142,7 +142,8 @@ class Controller:
     (:func:`~torchrl_sspl.modules.observer.held`): :math:`B(\hat z_t) \le 0` is kept whatever is seen. What is seen has to agree:
     the premise of the proof (Theorem F in ``docs/theory.md``), watched at every step, is that the episode began in the set
     and that every observation by itself lies in it, :math:`B(E(o_t)) \le 0`. Where K = I nothing is cut, and no correction may
-    be above :math:`\delta`. Numbers that are not finite meet no premise.
+    be above :math:`\delta`. Numbers that are not finite meet no premise, and from actions on that are neither the agent's own nor
+    checked by a filter (:meth:`took`) nothing is proved. What is proved is read when a controller is made.
     Source: none.
 
     Args:
@@ -169,7 +170,7 @@ class Controller:
         self._proved = agent.tolerated_error  # as numbers, which a graph does not compute anew
         self._look = compiled(self.looked) if compile else self.looked
         self._applies = torch.ones(batch_size, dtype=torch.bool, device=agent.gain.device)
-        self._last: tuple[Tensor, torch.Size] | None = None  # latent, and the shape of the action that was told
+        self._last: tuple[Tensor, Tensor] | None = None  # latent, and the action that was told
 
     @property
     def begins(self) -> Tensor:
@@ -220,7 +221,7 @@ class Controller:
         self._applies = self._applies & step.applies
         step.applies = self._applies.clone()  # the caller's, whom a reset of some rows does not reach
         self._memory.expect(predicted, rows)
-        self._last = step.latent, step.action.shape
+        self._last = step.latent, step.action
         return step
 
     def _judged(self, latent: Tensor, innovation: Tensor, seen: Tensor) -> tuple[Step, Tensor]:
@@ -234,12 +235,16 @@ class Controller:
         return step, agent.dynamics(latent, action)
 
     @torch.no_grad()
-    def took(self, action: Tensor, predicted: Tensor | None = None) -> None:
-        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told.
+    def took(self, action: Tensor, predicted: Tensor | None = None) -> Tensor:
+        """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told; returns ``(n,)`` bool,
+        whether the proof still applies.
+
+        It does to actions that were told, and to those of a filter with the proved margin; others end it until the next reset.
 
         Args:
             action: what was done.
-            predicted: ``(n, p)``, what a safety filter has found to follow (``Protected.predicted``); None: it is computed.
+            predicted: ``(n, p)``, what a safety filter with the proved margin has found to follow (``Protected.predicted``); None: it is
+                computed.
 
         Raises:
             ConfigError: before the first step since a reset.
@@ -248,16 +253,19 @@ class Controller:
         """
         if self._last is None:
             raise ConfigError("expected a step before took(), received none since the reset")
-        latent, shape = self._last
-        if action.shape != shape:
-            raise ShapeError(f"expected actions {tuple(shape)}, received {tuple(action.shape)}")
+        latent, told = self._last
+        if action.shape != told.shape:
+            raise ShapeError(f"expected actions {tuple(told.shape)}, received {tuple(action.shape)}")
         if predicted is not None and predicted.shape != latent.shape:
             raise ShapeError(f"expected latents {tuple(latent.shape)} after the actions, received {tuple(predicted.shape)}")
         if not all(bool(given.isfinite().all()) for given in (action, predicted) if given is not None):
             raise NonFiniteError("expected finite actions, and what follows them, received NaN or infinity; the memory stays as it was")
+        begins = self.begins
         if predicted is None:
             predicted = self.agent.dynamics(latent, action)
-        self._memory.expect(predicted, (~self.begins).nonzero()[:, 0])
+            self._applies = self._applies & ((action == told).all(1) | begins)
+        self._memory.expect(predicted, (~begins).nonzero()[:, 0])
+        return self._applies.clone()
 
 
 __all__ = ["Controller", "Memory", "Step", "correction", "meets_premise", "premise_met"]

@@ -75,7 +75,8 @@ def export(agent: Any, path: str | Path, *, check: int = 256, image_size: int | 
     Args:
         agent: frozen agent.
         path: file to write; its folder is created if necessary.
-        check: number of random steps on which the file is compared with the agent before this returns; 0: none.
+        check: number of steps on which the file is compared with the agent before this returns; 0: none. Half of their pictures are those
+            of random states where the description names a system of this library; the others are noise.
         image_size: height and width of the pictures in pixels, which the file fixes; ``None``: the encoder's, 64 where it takes any.
 
     Returns the path. Raises ConfigError for another suffix, or another size than the encoder's; MissingDependencyError without the packages of the extra
@@ -176,6 +177,21 @@ def _steps(agent: Any, n: int, seed: int) -> dict[str, Tensor]:
     }
 
 
+def _drawn(agent: Any, n: int, seed: int) -> Tensor | None:
+    """Pictures ``(n, 6, H, W)`` of random states, drawn by the system that the agent's description names; None where it names none of this
+    library, or one with other pictures."""
+    from torchrl_sspl.evaluation.blocks import described_system
+
+    factory = described_system(agent.description)
+    if factory is None or n < 1:
+        return None
+    env, g = factory(batch_size=[1], seed=seed), torch.Generator().manual_seed(seed)
+    if tuple(env.observation_spec["pixels"].shape[1:]) != picture_of(agent):
+        return None
+    state = env.sample_states(n, g)
+    return torch.cat([env.draw(env.previous_state(state)), env.draw(state)], 1)
+
+
 def _tied(agent: Any, wanted: dict[str, Tensor], found: dict[str, Tensor], spread: float) -> Tensor:
     """Steps ``(n,)`` on which a policy that chooses may do either, for all that rounding decides."""
     values = [agent.barrier(agent.dynamics(wanted["next_latent"], k["next_action"]))[:, 0] for k in (wanted, found)]
@@ -187,7 +203,9 @@ def _tied(agent: Any, wanted: dict[str, Tensor], found: dict[str, Tensor], sprea
 @torch.no_grad()
 def _compare(step: DeployedStep, file: bytes, suffix: str, n: int) -> None:
     """A CertificationError if the file does not compute what the agent does."""
-    given = _steps(step.agent, n, 1)
+    given, shown = _steps(step.agent, n, 1), _drawn(step.agent, n // 2, 1)
+    if shown is not None:  # noise lies outside of every set
+        given["pixels"][: len(shown)] = shown
     wanted = dict(zip(OUTPUTS, step(**given), strict=True))
     if suffix == ".pt2":
         found = dict(zip(OUTPUTS, torch.export.load(io.BytesIO(file)).module()(*given.values()), strict=True))

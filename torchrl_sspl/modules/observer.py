@@ -36,14 +36,15 @@ def gain_matrix(gain: float | Sequence[Any] | Tensor, latent_dim: int, seen_dim:
         >>> gain_matrix(0.5, 2).tolist()
         [[0.5, 0.0], [0.0, 0.5]]
     """
-    given = torch.as_tensor(gain, dtype=torch.float32).detach().cpu()
+    kept = isinstance(gain, Tensor) and gain.is_floating_point()  # a matrix of float64 is not rounded
+    given = torch.as_tensor(gain, dtype=None if kept else torch.float32).detach().cpu()
     shows = torch.arange(latent_dim) < (latent_dim if seen_dim is None else seen_dim)
     matrix = given * torch.diag(shows.float()) if given.ndim == 0 else given.clone()
     if matrix.shape != (latent_dim, latent_dim) or not bool(matrix.isfinite().all()):
         raise ConfigError(
             f"expected a gain that is a finite number or a ({latent_dim}, {latent_dim}) matrix, received {tuple(given.shape)}"
         )
-    left = float(torch.linalg.matrix_norm(torch.eye(latent_dim) - matrix, ord=2))
+    left = float(torch.linalg.matrix_norm(torch.eye(latent_dim, dtype=torch.float64) - matrix.double(), ord=2))
     if left > 1.0 + 1e-6 or not bool(matrix.any()):
         raise ConfigError(
             f"expected a gain K with |I - K| <= 1 that is not zero, such as a number in (0, 1], received |I - K| = {left:.3g}"

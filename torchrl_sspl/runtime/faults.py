@@ -74,7 +74,8 @@ class CameraFault:
             self.captured, self.history = self._own(pixels[:, :3]), []
         frame, before = self._own(pixels[:, 3:]), self.captured
         if t >= self.onset:
-            self.history.append(frame)
+            if self.name in _IN_TIME:  # the others remember nothing, however long they run
+                self.history.append(frame)
             frame = _IN_TIME[self.name](self, t - self.onset) if self.name in _IN_TIME else self._changed(frame, t)
         self.captured = frame
         return torch.cat([before, frame], 1)

@@ -96,8 +96,8 @@ class Shield:
 
     @cached_property
     def proved(self) -> bool:
-        r"""Whether the agent's set is proved to be kept, and the margin is at least :math:`\eta`."""
-        return self._default or (self.agent.tolerated_error > 0.0 and self.margin >= _proved_margin(self.agent))
+        r"""Whether the agent's set is proved to be kept, and the margin is at least :math:`\eta`; looked at once."""
+        return self.agent.tolerated_error > 0.0 and (self._default or self.margin >= _proved_margin(self.agent))
 
     @torch.no_grad()
     def __call__(self, latent: Tensor, wanted: Tensor, own: Tensor | None = None) -> Protected:

@@ -21,7 +21,7 @@ from tqdm import tqdm
 from torchrl_sspl.certification.certificate import weights_digest
 from torchrl_sspl.devices import compiled
 from torchrl_sspl.envs.base import SafetyEnv
-from torchrl_sspl.errors import CheckpointError, ConfigError, ShapeError
+from torchrl_sspl.errors import CheckpointError, ConfigError, DTypeError, ShapeError
 from torchrl_sspl.evaluation.controllers import Decision
 from torchrl_sspl.evaluation.simulation import simulate
 from torchrl_sspl.files import write
@@ -58,7 +58,7 @@ class Watched:
     action: Tensor  # (n, m) physical units, of the agent or of the fallback
     verdict: Tensor  # (n,) int64, see Verdict
     alarm: Tensor  # (n,) bool
-    applies: Tensor  # (n,) bool, whether the premise of the proof has held since the reset, during an alarm too
+    applies: Tensor  # (n,) bool, whether the premise of the proof has held since the reset, during an alarm too, under actions that keep it
     barrier: Tensor  # (n,) B of the memory
     signals: dict[str, Tensor]  # (n,) by name; NaN where there is nothing to compare
     reasons: list[list[str]]  # of every row, the signals beyond their limits in this step
@@ -155,7 +155,7 @@ class Monitor:
     frame from itself one step later, of 1), ``still`` (steps during which not one pixel changed). A signal
     beyond its limit is an alarm, which ends after so many clean steps. Frames of another size or kind, missing frames and times that do not fit are alarms at once; the memory then goes on with
     what it expects. Limits lie 5 % beyond the largest values of clean episodes (:func:`calibrate`), so that a clean episode has an
-    alarm with a probability of at most :attr:`Calibration.false_alarms`. Source: none (novelty by reconstruction; limits by
+    alarm with a probability of at most :attr:`Calibration.false_alarms`, while the agent itself acts and for as many steps as were calibrated. Source: none (novelty by reconstruction; limits by
     exchangeability, as in conformal prediction).
 
     Args:
@@ -171,6 +171,7 @@ class Monitor:
 
     Raises:
         ConfigError: for options that are not valid.
+        CheckpointError: for a calibration of other weights.
 
     Example:
         >>> black = torch.zeros(1, 6, 64, 64, dtype=torch.uint8)
@@ -197,8 +198,11 @@ class Monitor:
                 f"expected batch_size >= 1, clear_after >= 1, fallback in {FALLBACKS} or a function, and a positive period or None, "
                 f"received {batch_size}, {clear_after}, {fallback!r} and {period}"
             )
-        calibration.model.to(agent.gain.device)
-        self.agent, self.calibration, self.batch_size = agent, calibration, batch_size
+        weights = agent.state_dict()
+        if calibration.weights not in (weights_digest(weights), weights_digest({k: v.float() for k, v in weights.items()})):
+            raise CheckpointError("expected a calibration of this agent, received one of other weights; make one: sspl.calibrate(agent, env)")
+        own = copy.deepcopy(calibration.model).to(agent.gain)  # another monitor's calibration may be this one
+        self.agent, self.calibration, self.batch_size, self._model = agent, calibration, batch_size, own
         self.fallback, self.period, self.clear_after, self.signals = fallback, period, clear_after, tuple(signals)
         self._controller = Controller(agent, batch_size)
         self._look = compiled(self._looked) if compile else self._looked
@@ -211,14 +215,14 @@ class Monitor:
         return cls(agent, Calibration.load(name, agent), **options)
 
     def reset(self, rows: Tensor | None = None) -> None:
-        """Begin new episodes: all n, or those of some rows (indices or a mask)."""
+        """Begin new episodes: all n, or those of some rows (indices or a mask); a ShapeError for others."""
         n, device = self.batch_size, self.agent.gain.device
+        self._controller.reset(rows)
         index = slice(None) if rows is None else torch.arange(n, device=device)[rows]
         if rows is None:
             self._quiet, self._still = torch.zeros(n, dtype=torch.int64, device=device), torch.zeros(n, device=device)
             self._frame: Tensor | None = None
             self._time: Tensor | None = None
-        self._controller.reset(rows)
         self._quiet[index], self._still[index] = self.clear_after, 0.0
 
     @torch.no_grad()
@@ -227,15 +231,18 @@ class Monitor:
 
         Args:
             pixels: ``(n, 6, H, W)`` uint8, frames t-1 and t; ``None`` if no picture came.
-            time: when the pictures were taken, a number or ``(n,)``.
+            time: when the pictures were taken, a number or ``(n,)``; with a ``period``, and not without.
 
-        Raises ShapeError for another number of pictures.
+        Raises ShapeError for another number of pictures, DTypeError for what is no tensor, ConfigError for a time without a period or
+        pictures without the time that is to be compared with it.
         """
         n, fresh = self.batch_size, self._controller.begins
-        late = self._late(time, fresh)
+        if pixels is not None and not isinstance(pixels, Tensor):
+            raise DTypeError(f"expected pixels as a tensor of dtype torch.uint8, received {type(pixels).__name__}; torch.as_tensor(pixels) makes one of numpy")
         if pixels is not None and (pixels.ndim < 1 or len(pixels) != n):
             raise ShapeError(f"expected pictures of {n} systems, received {tuple(pixels.shape)}; make a monitor for them")
-        reasons = [[] for _ in range(n)] if late is None else [["time"] if bool(one) else [] for one in late]
+        late = self._late(pixels, time, fresh)
+        reasons = [[] for _ in range(n)] if late is None else [["time"] if one else [] for one in late.tolist()]
         fault = self._unreadable(pixels)
         if fault or pixels is None:  # the memory goes on with what it expects, and the proof no longer applies
             step = self._controller.step(None)
@@ -254,19 +261,20 @@ class Monitor:
                 reasons[k].append(self.signals[which])
         return self._decided(step, signals, reasons)
 
-    def took(self, action: Tensor, predicted: Tensor | None = None) -> None:
+    def took(self, action: Tensor, predicted: Tensor | None = None) -> Tensor:
         """Say what was really done after a step, ``(n, m)`` physical units, where it was not the action that was told, and what a safety
-        filter has found to follow ``(n, p)``; else that is computed.
+        filter with the proved margin has found to follow ``(n, p)``; else that is computed. Returns ``(n,)`` bool, whether the proof still
+        applies: other actions than the agent's own and a filter's end it until the next reset.
 
         A ConfigError before the first step, a ShapeError for actions or latents of another shape, a NonFiniteError for NaN among them.
         """
-        self._controller.took(action, predicted)
+        return self._controller.took(action, predicted)
 
     def _looked(self, pixels: Tensor, prior: Tensor, begins: Tensor) -> tuple[Step, Tensor, dict[str, Tensor]]:
         """The controller's look, and the signals of the newest frame; nothing is remembered, so that it can be compiled."""
         step, predicted = self._controller.looked(pixels, prior, begins)
-        frame = pixels[:, 3:].float() / 255.0
-        off = (small(frame) - self.calibration.model(step.seen)).abs().mean(1)
+        frame = pixels[:, 3:].to(step.seen.dtype) / 255.0
+        off = (small(frame) - self._model(step.seen)).abs().mean(1)
         texture = (frame.diff(dim=-1).abs().mean((1, 2, 3)) + frame.diff(dim=-2).abs().mean((1, 2, 3))) / 2
         innovation = step.innovation.masked_fill(begins, math.nan)
         return step, predicted, {"innovation": innovation, "picture": off.mean((1, 2)), "place": off.amax((1, 2)), "texture": texture}
@@ -288,9 +296,14 @@ class Monitor:
         wrong = pixels.ndim != 4 or pixels.shape[1] != 6 or (size is not None and tuple(pixels.shape[2:]) != tuple(size))
         return "kind" if pixels.dtype != torch.uint8 else "size" if wrong else ""
 
-    def _late(self, time: float | Tensor | None, fresh: Tensor) -> Tensor | None:
+    def _late(self, pixels: Tensor | None, time: float | Tensor | None, fresh: Tensor) -> Tensor | None:
         """``(n,)`` bool, which pictures came too early or too late; None where nobody looks."""
-        if time is None or self.period is None:
+        if (self.period is None and time is not None) or (self.period is not None and time is None and pixels is not None):
+            raise ConfigError(
+                f"expected a time with every picture of a monitor that has a period, and none without, received period={self.period} and "
+                f"time={time}; Monitor(..., period=dt) and step(pixels, time=t) go together"
+            )
+        if time is None:
             return None
         now = torch.as_tensor(time, dtype=torch.float64, device=fresh.device).expand(self.batch_size).clone()
         before, self._time = self._time, now
@@ -464,7 +477,7 @@ def calibrate(
     latents, shown = [], []
     for part in env.sample_states(pictures, g).split(1000):
         now, before = env.draw(part), env.draw(env.previous_state(part))
-        latents.append(agent.encode(torch.cat([before, now], 1)))
+        latents.append(agent.encode(torch.cat([before, now], 1)).float())
         shown.append(small(now.float() / 255.0))
     model.fit(torch.cat(latents), torch.cat(shown), steps=steps, seed=spawn(seed, "monitor", 2), progress=progress)
     wide = {name: (-math.inf, math.inf) for name in SIGNALS}

@@ -33,7 +33,8 @@ class SafetyWrapper(gymnasium.Wrapper):
         **options: of :class:`~torchrl_sspl.runtime.Shield`; errors too.
 
     Raises:
-        ConfigError: if observations are no such pictures, or the range of actions is another than the agent's.
+        ConfigError: if observations are no such pictures, the range of actions is another than the agent's, or the environment
+            resets itself.
         ShapeError: if the pictures are of another size than those the agent was trained on.
 
     Example:
@@ -45,6 +46,14 @@ class SafetyWrapper(gymnasium.Wrapper):
     def __init__(self, env: gymnasium.Env, agent: Agent, **options: Any) -> None:
         if isinstance(env, VectorEnv):
             raise ConfigError("expected a single environment, received a vectorised one; use SafetyVectorWrapper(env, agent)")
+        inner: Any = env
+        while isinstance(inner, gymnasium.Wrapper):
+            if isinstance(inner, gymnasium.wrappers.Autoreset):  # it begins an episode without a word
+                raise ConfigError(
+                    "expected an environment whose episodes begin with reset(), received one inside of Autoreset, after which the memory of an "
+                    "episode would go on in the next; put Autoreset around this wrapper"
+                )
+            inner = inner.env
         super().__init__(env)
         self._guard = _Guard(agent, env.observation_space, env.action_space, 1, options)
         self.agent, self.shield, self.statistics = agent, self._guard.shield, self._guard.statistics

@@ -78,7 +78,7 @@ def watch(
         name: shipped agent, run directory with a calibration, or that of a training.
         env: a system as in ``sspl train env=...``, or ``"physics"``: the agent's own one in full physics; default: the agent's own one.
         video: film file in place of a system; nothing can be done there, so that what happens is not
-            what the agent expects of its own actions.
+            what the agent expects of its own actions, and no proof applies.
         policy: ``"own"``, or ``"random"``: uniform actions, each held for five steps on average.
         protect: put the safety filter behind the policy; the margin of an agent without a proof is .02.
         record: an .mp4 file to write.
@@ -119,7 +119,7 @@ def watch(
         time.sleep(max(0.0, due - time.monotonic()))
 
     camera = CameraFault("dark", 1.0, noise=noise if video is None else 0.0, seed=seed)
-    view = _View(monitor, shield, camera, show, steps, random=policy == "random", seed=seed)
+    view = _View(monitor, shield, camera, show, steps, random=policy == "random", seed=seed, film=video is not None)
     try:
         with served(host, port, feed, lambda: page) as address:
             film = None if record is None else _Film(Path(record), min(fps or pace, 60.0), f"{name}: {about}")
@@ -236,9 +236,12 @@ class _View:
 
     def __init__(
         self, monitor: Monitor, shield: Shield | None, camera: CameraFault, show: Callable[[dict[str, Any], NDArray[np.uint8]], None],
-        steps: int | None, *, random: bool, seed: int,
+        steps: int | None, *, random: bool, seed: int, film: bool = False,
     ) -> None:  # fmt: skip
+        self.film = film  # nobody knows what acts there
         self.monitor, self.shield, self.camera, self.show, self.steps, self.random = monitor, shield, camera, show, steps, random
+        self.proved = monitor.agent.tolerated_error > 0.0
+        self.checked = shield is not None and shield.proved
         self.scale: Tensor = monitor.agent.policy.action_scale.flatten()  # type: ignore[operator, union-attr, assignment]
         self.generator, self.held = torch.Generator().manual_seed(seed), torch.zeros(1, len(self.scale))
         self.counts = {"steps": 0, "interventions": 0, "alarms": 0, "entered": 0}
@@ -259,11 +262,13 @@ class _View:
         wanted = self.held if self.random else out.action
         made = None if self.shield is None else self.shield(out.latent, wanted)
         taken = wanted if made is None else made.action
-        self.monitor.took(taken, None if made is None else made.predicted)
+        applies = self.monitor.took(taken, made.predicted if made is not None and self.checked else None)
         intervened = made is not None and bool(made.intervened)
         counts["steps"] += 1
         counts["interventions"] += intervened
         counts["alarms"] += bool(out.alarm)
+        if self.film or not bool(applies):  # what acts is neither the agent nor the filter, and nothing is proved of it
+            out.verdict = torch.where(out.verdict == Verdict.PROOF_APPLIES, Verdict.INSIDE, out.verdict)
         self.missed += int(out.verdict) == Verdict.INSIDE
         label, colour = VERDICTS[Verdict(int(out.verdict))]
         event = {
@@ -296,7 +301,11 @@ class _View:
         if int(out.verdict) == Verdict.OUTSIDE:
             return f"B = {float(out.barrier):+.3f} > 0"
         if int(out.verdict) == Verdict.INSIDE:
-            why = "nothing is proved of this agent" if not self.monitor.agent.tolerated_error > 0.0 else f"not met for {self.missed} steps"
+            why = f"not met for {self.missed} steps"
+            if not self.proved:
+                why = "nothing is proved of this agent"
+            elif self.film or (self.random and not self.checked):
+                why = "nothing is proved of what acts here"
             return f"B = {float(out.barrier):+.3f} <= 0; {why}"
         seen = "the first picture" if math.isnan(value) else f"innovation {value:.3f} of at most {limits['innovation'][1]:.3f}"
         return f"B = {float(out.barrier):+.3f} <= 0; {seen}"
