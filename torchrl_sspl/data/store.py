@@ -30,11 +30,23 @@ class _Behind(RoundRobinWriter):
 
     def add(self, data: Any) -> Any:
         self._cursor = self._storage._cursor
+        if getattr(data, "batch_size", torch.Size(())).numel() != 1:  # a collector that writes by itself writes step after step of all environments
+            raise ShapeError(
+                f"store: expected one transition at a time, received {tuple(data.batch_size)}; frames are shared along an episode: extend the buffer "
+                "by what a collector yields, buffer.extend(data.reshape(-1)), in place of Collector(replay_buffer=buffer)"
+            )
         return super().add(data)
 
     def extend(self, data: Any) -> Any:
         self._cursor = self._storage._cursor
         return super().extend(data)
+
+
+class _Buffer(TensorDictReplayBuffer):
+    """Takes batches of any shape, time last, and of TorchRL's padded trajectories what is no padding."""
+
+    def extend(self, tensordicts: Any, **options: Any) -> Tensor:
+        return super().extend(without_padding(tensordicts).reshape(-1), **options)
 
 
 class TransitionStore(Storage):
@@ -264,7 +276,7 @@ class TransitionStore(Storage):
         TorchRL, such as ``PrioritizedSampler``, takes the place of the stratified one.
         """
         buffer = {"sampler": RegionSampler(safe, unsafe), "writer": _Behind(), "collate_fn": _as_it_is, **buffer}
-        return TensorDictReplayBuffer(storage=self, batch_size=batch_size, **buffer)
+        return _Buffer(storage=self, batch_size=batch_size, **buffer)
 
     def state_dict(self) -> dict[str, Any]:
         """All transitions and frames as tensors, frames without gaps; see ``load_state_dict``."""

@@ -102,6 +102,16 @@ def _check_loaded(loss: LossModule, state: dict[str, Any], prefix: str, *_: Any)
         _check_raised(loss, name, state.get(prefix + name))
 
 
+def _check_written(loss: LatentLoss) -> None:
+    """As :func:`_check_raised`, of weights that were written into in place, ``loss.growth_coeff.copy_(0.5)``, since the last look."""
+    held = [getattr(loss, name) for name in loss.__dict__.get("_left_out", ())]
+    now = [(id(value), None if value.is_inference() else value._version) for value in held]
+    if now != loss.__dict__.get("_looked_at"):
+        for name, value in zip(loss.__dict__.get("_left_out", ()), held, strict=True):
+            _check_raised(loss, name, value)
+        loss.__dict__["_looked_at"] = now
+
+
 def _meant(loss: LatentLoss, name: str, network: Any) -> NestedKey:
     """Which of the entries that a network writes is meant."""
     action = loss.tensor_keys.action  # its name may have been changed since
@@ -454,6 +464,8 @@ class LatentLoss(LossModule):
     def _read(self, tensordict: TensorDictBase) -> LatentBatch:
         """Latents, action, labels and masks of a batch, as far as the active terms need them."""
         keys, needs = self.tensor_keys, self._needs
+        if not is_compiling():
+            _check_written(self)
         valid = _valid(tensordict, self._loss_mask_keys())
         latents = self._encode(tensordict, valid, True, "next_latent" in needs, "online")
         batch = LatentBatch(latents[0], valid=valid)

@@ -110,7 +110,10 @@ class SSPLLoss(SaLaDLoss, SynthesisLoss, PolicyDeviationLoss):
         return self._weighted([(self.salad_coeff, self._salad_terms(self._read(tensordict)))], tensordict)
 
     def _weighted(self, parts: list[tuple[Tensor, dict[str, Tensor]]], tensordict: TensorDictBase) -> TensorDict:
-        terms = {} if len(parts) > 1 else dict.fromkeys(self.out_keys, self.salad_coeff.new_zeros(()))
+        terms: dict[str, Tensor] = {}
+        if len(parts) == 1:
+            none = self.salad_coeff.new_zeros(()), self.salad_coeff.new_zeros(tensordict.batch_size if self.reduction == "none" else ())
+            terms = {key: none[key.startswith("loss_")] for key in self.out_keys}
         for weight, part in parts:
             for key, value in part.items():
                 terms[key] = weight * value if key.startswith("loss_") else value

@@ -135,7 +135,8 @@ class SeedHook(_Hook):
     """Gives the environments a new seed, drawn from torch's generator, before every collected batch.
 
     A checkpoint cannot hold the inner state of an arbitrary environment. With this seed and a collector that resets at
-    each iteration, what a batch holds depends on nothing else than what the checkpoint does hold. Source: none.
+    each iteration, what a batch holds depends on nothing else than what the checkpoint does hold. Other collectors are left alone after the
+    first seed: some environments begin an episode where they are seeded, of which the collector knows nothing. Source: none.
     """
 
     name, stages, kept = "seeds", {"setup": "setup", "post_steps": "__call__"}, ("seed",)
@@ -152,8 +153,9 @@ class SeedHook(_Hook):
 
     def __call__(self) -> None:
         """Draws and sets the seed of the next batch."""
-        self.seed = int(torch.randint(2**31 - 1, (), dtype=torch.int64))
-        self.collector.set_seed(self.seed)
+        first, self.seed = self.seed < 0, int(torch.randint(2**31 - 1, (), dtype=torch.int64))
+        if first or getattr(self.collector, "reset_at_each_iter", True):
+            self.collector.set_seed(self.seed)
 
 
 class FitEncoderHook(_Hook):
@@ -172,6 +174,10 @@ class FitEncoderHook(_Hook):
         if self.trainer.optimization_stepper.count == 0:
             index = torch.linspace(0, len(self.store) - 1, min(self.frames, len(self.store))).long()
             self.encoder.fit(self.store.get(index)["frames"][:, 1])
+            delayed = getattr(self.trainer.loss_module, "target_encoder_params", None)
+            for name, value in () if delayed is None else self.trainer.loss_module.encoder_params.items(True, True):
+                if not value.requires_grad:  # a target-network updater follows parameters alone
+                    delayed.get(name).data.copy_(value)
 
 
 class ClockHook(_Hook):

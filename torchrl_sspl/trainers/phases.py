@@ -450,6 +450,8 @@ class Phases(TrainerHookBase):
             self._save(force_save=True)  # the joint training is done
             work.begin()
         work.loop.tick = self._tick
+        for net in (work.encoder, work.networks):
+            net.eval()  # as in the agent: dropout would show other latents each time
         own_bar = self.bar is None
         if own_bar:
             self.bar = Progress(self.steps, self.steps_done, shown=self.progress, out_dir=work.out_dir)
@@ -504,7 +506,8 @@ class Phases(TrainerHookBase):
     def state_dict(self) -> dict[str, Any]:
         """Which phases are done, and the workspace once the first has begun."""
         work = self.work.state_dict() if self.begun else None
-        return {"done": self.done, "begun": self.begun, "weights": self.weights, "work": work}
+        listed = [[phase.name, phase.number] for phase in self.phases]
+        return {"done": self.done, "begun": self.begun, "weights": self.weights, "work": work, "phases": listed}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
@@ -513,6 +516,14 @@ class Phases(TrainerHookBase):
                 f"expected a checkpoint of these {len(self.phases)} phases, received one after {state['done']}; leave what adds phases (evaluation.calibrate, "
                 "synthesis) as it was, or give another out_dir"
             )
+        count = int(state["done"]) + bool(state["begun"])  # those that are over, and the one that goes on
+        before = [tuple(phase) for phase in state.get("phases", [])[:count]]
+        now = [(phase.name, phase.number) for phase in self.phases[:count]]
+        if before and before != now:  # none: of an earlier version
+            raise CheckpointError(
+                f"expected a checkpoint of phases that begin with {now}, received one of {before}; leave those that have begun as they were, or begin "
+                "again in another out_dir"
+            )
         self.done, self.resumed, self.weights = int(state["done"]), bool(state["begun"]), state.get("weights", [])
         if self.resumed:
             self.work.load_state_dict(state["work"])
@@ -520,6 +531,7 @@ class Phases(TrainerHookBase):
     def register(self, trainer: Trainer, name: str = "phases") -> None:
         self.trainer = trainer
         trainer.register_op("post_steps", self)
+        trainer.register_op("shutdown", self)  # of a training that is resumed when its collector has ended
         trainer.register_op("post_steps_log", lambda batch: self())  # of a training that ended in this very stage, before its collector ends
         trainer.register_module(name, self)
 

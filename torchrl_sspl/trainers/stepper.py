@@ -13,6 +13,7 @@ from torchrl.trainers import OptimizationStepper, Trainer
 
 from torchrl_sspl.errors import ConfigError
 from torchrl_sspl.objectives import LipschitzLoss
+from torchrl_sspl.sets import SAFE, UNSAFE
 
 
 @contextmanager
@@ -38,7 +39,7 @@ class SSPLStepper(OptimizationStepper):
         optimizer: optimiser of the total loss.
         warm_start_steps: steps on the world model alone; -1: all of them.
         warm_start_error: the warm start goes on until S and U are told apart: until the running mean of ``safe_error``
-            + ``unsafe_error`` (over about fifty steps) is at most this. Until then the worst rows do not count extra.
+            + ``unsafe_error`` (each over about fifty steps that have some of its set) is at most this. Until then the worst rows do not count extra.
             ``None`` goes by the number of steps alone.
         lipschitz_loss: :math:`L_M`, for an ``LMIBarrier``; ``None`` for barriers that are Lipschitz by construction.
         lipschitz_optimizer: optimiser of :math:`L_M`; needed with ``lipschitz_loss``.
@@ -77,7 +78,7 @@ class SSPLStepper(OptimizationStepper):
         self.optimizer, self.lipschitz_optimizer, self.lipschitz_loss = optimizer, lipschitz_optimizer, lipschitz_loss
         self.warm_start_steps, self.warm_start_error = warm_start_steps, warm_start_error
         self.autocast, self.count = autocast, 0
-        self.mislabelled = 2.0  # running mean of the two errors; both are 1 at worst
+        self._errors = [1.0, 1.0]  # running means, of S and of U
         self.begin_batch()
 
     def begin_batch(self) -> None:
@@ -90,13 +91,18 @@ class SSPLStepper(OptimizationStepper):
         return {key: value / self.inside for key, value in self.sums.items()}
 
     @property
+    def mislabelled(self) -> float:
+        """Running mean of the two errors; both are 1 at worst."""
+        return sum(self._errors)
+
+    @property
     def unseparated(self) -> bool:
         """Whether S and U are yet to be told apart."""
         return self.warm_start_error is not None and self.mislabelled > self.warm_start_error
 
     def restart(self) -> None:
         """Begins the warm start again, for fresh weights: counter and moments of the optimisers are forgotten."""
-        self.count, self.mislabelled = 0, 2.0
+        self.count, self._errors = 0, [1.0, 1.0]
         for optimizer in (self.optimizer, self.lipschitz_optimizer):
             if optimizer is not None:
                 optimizer.state.clear()
@@ -118,12 +124,19 @@ class SSPLStepper(OptimizationStepper):
         self.optimizer.step()
         self._backtrack(before)
         if unseparated:  # only now: a GPU is waited for here
-            self.mislabelled += 0.02 * (float(terms["safe_error"] + terms["unsafe_error"]) - self.mislabelled)
+            self._look(trainer.loss_module, sub_batch, terms)
         extra = {"grad_norm": norm.detach(), "warm_start": torch.tensor(float(warm)), **self._lipschitz_step()}
         told = {**dict(terms.detach().items()), **extra}
         self.sums = {key: self.sums[key] + value if self.sums else value for key, value in told.items()}
         self.inside += 1
         return TensorDict(told, batch_size=[])
+
+    def _look(self, loss: Any, batch: TensorDictBase, terms: TensorDictBase) -> None:
+        """The errors of a batch, of those sets that it holds: where there is nothing, nothing is wrong."""
+        region = batch[loss.tensor_keys.region]
+        for k, (code, name) in enumerate(((SAFE, "safe_error"), (UNSAFE, "unsafe_error"))):
+            if bool((region == code).any()):
+                self._errors[k] += 0.02 * (float(terms[name]) - self._errors[k])
 
     def _clip(self, trainer: Trainer) -> Tensor:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
@@ -159,7 +172,7 @@ class SSPLStepper(OptimizationStepper):
 
     def state_dict(self) -> dict[str, Any]:
         """Counters, progress of the warm start, sums of the terms, and both optimisers."""
-        state: dict[str, Any] = {"count": self.count, "mislabelled": self.mislabelled, "optimizer": self.optimizer.state_dict()}
+        state: dict[str, Any] = {"count": self.count, "errors": list(self._errors), "optimizer": self.optimizer.state_dict()}
         state |= {"inside": self.inside, "sums": dict(self.sums)}
         if self.lipschitz_optimizer is not None:
             state["lipschitz_optimizer"] = self.lipschitz_optimizer.state_dict()
@@ -167,7 +180,8 @@ class SSPLStepper(OptimizationStepper):
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what ``state_dict`` returned."""
-        self.count, self.mislabelled = int(state_dict["count"]), float(state_dict["mislabelled"])
+        self.count = int(state_dict["count"])
+        self._errors = list(state_dict.get("errors") or [float(state_dict["mislabelled"]) / 2] * 2)  # one number in earlier versions
         self.inside, self.sums = int(state_dict.get("inside", 0)), dict(state_dict.get("sums", {}))
         self.optimizer.load_state_dict(state_dict["optimizer"])
         if self.lipschitz_optimizer is not None:

@@ -57,6 +57,20 @@ def _check_sizes(checkpoint: Path) -> None:
                     raise ValueError(f"{found} bytes in place of {size} in {about.parent.relative_to(checkpoint) / name}.memmap")
 
 
+def _takes(collector: Any, policy: TensorDictModuleBase) -> bool:
+    """Whether a collector's policy is to be given the weights of this one; a ConfigError if it is another one with weights of its own."""
+    acts = getattr(collector, "policy", None)
+    if not isinstance(acts, torch.nn.Module):  # in other processes
+        return True
+    has, wanted = ({name for name, _ in net.named_parameters()} for net in (acts, policy))
+    if has and not wanted <= has:
+        raise ConfigError(
+            f"expected a collector whose policy has the parameters of rollout_policy, received one that lacks {sorted(wanted - has)[:3]}; give it as "
+            "rollout_policy=..., or let the collector act by make_rollout_policy(salad, policy)"
+        )
+    return bool(has)  # random actions have none
+
+
 class SSPLTrainer(Trainer):
     r"""Algorithm 1 on TorchRL's trainer.
 
@@ -81,7 +95,8 @@ class SSPLTrainer(Trainer):
             ``SoftUpdate(loss_module, tau=0.01)`` then.
         lipschitz_loss, lipschitz_optimizer: :math:`L_M` for an ``LMIBarrier``, and its optimiser.
         margins: re-estimates the margins; ``None`` keeps those of the loss.
-        rollout_policy: policy of the collector in other processes; by default encoder and policy of the loss.
+        rollout_policy: policy whose weights the collector is given after every batch, by default encoder and policy of the loss; a collector
+            whose policy has no weights keeps it.
         evaluate, evaluate_every: ``trainer -> mapping of floats``, logged after so many batches; the entry ``"stop"``
             (a text) ends the training.
         draw, draw_every: ``trainer -> mapping of names to figures``, given to the logger after so many batches.
@@ -211,7 +226,7 @@ class SSPLTrainer(Trainer):
             self.register_op("post_optim", TargetNetUpdaterHook(self.target_net_updater))
         if rollout_policy is None and loss.encoder is not None:
             rollout_policy = make_rollout_policy(loss.encoder, loss.actor_network)
-        if rollout_policy is not None:
+        if rollout_policy is not None and _takes(self.collector, rollout_policy):
             weights = partial(TensorDict.from_module, rollout_policy)
             self.register_op("post_steps", UpdateWeights(self.collector, 1, policy_weights_getter=weights))
         encoder = getattr(loss.encoder, "module", None)
