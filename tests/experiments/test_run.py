@@ -153,10 +153,10 @@ def test_a_start_that_still_improves_is_not_given_up():
         (100, 0.5, 2),  # the second start no better than the first one was
         (100, 0.5, 2),  # twice is all
     ):
-        stepper.count, stepper.mislabelled = count, mislabelled
+        stepper.count, stepper._errors = count, [0.0, mislabelled]
         hook()
         assert hook.restarts == restarts
-    stepper.count, stepper.mislabelled, hook.restarts = 200, 0.04, 0
+    stepper.count, stepper._errors, hook.restarts = 200, [0.0, 0.04], 0
     hook()
     assert hook.restarts == 0  # told apart
     assert trainer.loss_module.weight.item() == 2.0

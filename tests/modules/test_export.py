@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -173,3 +174,15 @@ def test_the_pictures_that_a_file_is_compared_on_lie_on_both_sides(name):
     assert 4 < int(inside.sum()) < 60
     agent.description = {}
     assert _drawn(agent, 64, 1) is None
+
+
+def test_a_file_that_never_meets_the_premise_is_noticed(monkeypatch):
+    step = DeployedStep(load("quadruped"))
+
+    def never(*given):
+        found = dict(zip(OUTPUTS, step(*given), strict=True))
+        return tuple((found | {"met": torch.zeros_like(found["met"])}).values())
+
+    monkeypatch.setattr(torch.export, "load", lambda file: SimpleNamespace(module=lambda: never))
+    with pytest.raises(CertificationError, match=r"'met': 0\.[0-9]*[1-9]"):
+        _compare(step, b"", ".pt2", 64)

@@ -412,7 +412,10 @@ def test_the_proof_ends_with_actions_that_nobody_has_checked():
     controller.reset(torch.tensor([1]))
     again.action[1] += 1.0
     assert controller.took(again.action).all()  # row 1 was of an episode that is over
-    assert controller.step(frames(3)).applies.all()
+    out = controller.step(frames(3))
+    assert out.applies.all()
+    out.action.neg_()  # what was told stays what was told
+    assert not controller.took(out.action).any()
 
 
 def test_a_gain_of_float64_is_not_rounded():

@@ -5,7 +5,26 @@ from __future__ import annotations
 BASE, SALAD, STORE = "torchrl_sspl/objectives/base.py", "torchrl_sspl/modules/salad.py", "torchrl_sspl/data/store.py"
 LOSSES, STORED = "tests/objectives/test_what_is_given.py", "tests/data/test_store.py"
 
+HOOKS, STEPPER, PHASES = "torchrl_sspl/trainers/hooks.py", "torchrl_sspl/trainers/stepper.py", "torchrl_sspl/trainers/phases.py"
+TRAINER, SSPL, LOOPS = "torchrl_sspl/trainers/trainer.py", "torchrl_sspl/objectives/sspl.py", "tests/trainers/test_own_loops.py"
+
 MUTANTS = [
+    (HOOKS, "delayed.get(name).data.copy_(value)", "pass", LOOPS),
+    (HOOKS, 'if first or getattr(self.collector, "reset_at_each_iter", True):', "if True:", LOOPS),
+    (HOOKS, 'if first or getattr(self.collector, "reset_at_each_iter", True):', "if first:", LOOPS),
+    (PHASES, '        trainer.register_op("shutdown", self)', "        None", LOOPS),
+    (PHASES, "if before and before != now:", "if False:", LOOPS),
+    (PHASES, 'int(state["done"]) + bool(state["begun"])', 'int(state["done"])', LOOPS),
+    (STEPPER, "if bool((region == code).any()):", "if True:", LOOPS),
+    (STEPPER, '"safe_error"), (UNSAFE, "unsafe_error")', '"unsafe_error"), (UNSAFE, "safe_error")', LOOPS),
+    (STORE, "super().extend(without_padding(tensordicts).reshape(-1), **options)", "super().extend(tensordicts.reshape(-1), **options)", LOOPS),
+    (STORE, "super().extend(without_padding(tensordicts).reshape(-1), **options)", "super().extend(without_padding(tensordicts), **options)", LOOPS),
+    (STORE, "torch.Size(())).numel() != 1:", "torch.Size(())).numel() > 9:", LOOPS),
+    (TRAINER, "if has and not wanted <= has:", "if False:", LOOPS),
+    (TRAINER, "return bool(has)", "return True", LOOPS),
+    (BASE, "            _check_written(self)\n", "            pass\n", LOOPS),
+    (BASE, "if now != loss.__dict__.get(", "if None is loss.__dict__.get(", LOOPS),
+    (SSPL, 'if self.reduction == "none" else ()', 'if False else ()', LOOPS),
     (BASE, "output[network.out_keys.index(key)]", "output[0]", LOSSES),
     (BASE, "if name == \"barrier\" and output.shape", "if False and output.shape", LOSSES),
     (BASE, "if name in loss.__dict__.get(\"_left_out\", ()) and", "if False and", LOSSES),

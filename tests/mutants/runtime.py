@@ -8,7 +8,24 @@ OBSERVED, FILTERED, RUN_TIME = "tests/modules/test_observer.py", "tests/runtime/
 
 DIRECTION, TURNED = "torchrl_sspl/direction.py", "tests/test_direction.py"
 
+DEVICES, SHAPES = "torchrl_sspl/devices.py", "tests/test_devices.py"
+LIVE, LOOKED = "torchrl_sspl/viz/live.py", "tests/viz/test_live.py"
+
 MUTANTS = [
+    (CONTROLLER, "((action == told).all(1) | begins)", "True", OBSERVED),
+    (CONTROLLER, "((action == told).all(1) | begins)", "(action == told).all(1)", OBSERVED),
+    (CONTROLLER, "((action == told).all(1) | begins)", "begins", OBSERVED),
+    (OBSERVER, "dtype=None if kept else torch.float32", "dtype=torch.float32", OBSERVED),
+    (MONITOR, "if calibration.weights not in (", "if False and calibration.weights not in (", WATCHED),
+    (MONITOR, "(self.period is None and time is not None) or", "", WATCHED),
+    (MONITOR, "or (self.period is not None and time is None and pixels is not None)", "", WATCHED),
+    (MONITOR, "time is None and pixels is not None)", "time is None)", WATCHED),
+    (WRAPPER, "isinstance(inner, gymnasium.wrappers.Autoreset)", "False", FILTERED),
+    (FAULTS, "if self.name in _IN_TIME:  #", "if True:  #", WATCHED),
+    (DEVICES, 'type(error).__name__ == "FailOnRecompileLimitHit"', "False", SHAPES),
+    (LIVE, "if self.film or not bool(applies):", "if self.film:", LOOKED),
+    (LIVE, "if self.film or not bool(applies):", "if not bool(applies):", LOOKED),
+    (EXPORT, 'given["pixels"][: len(shown)] = shown', "pass", EXPORTED),
     (DIRECTION, "math.sqrt(max(0.0, 1.0 - (0.5 * error / self.radius) ** 2))", "1.0", TURNED),
     (DIRECTION, "clamped if direction is None else direction.onto(clamped)", "clamped", TURNED),
     (DIRECTION, "x * sin + y * cos", "x * sin - y * cos", TURNED),

@@ -244,3 +244,19 @@ def test_under_random_actions_no_proof_applies_but_behind_the_filter():
     assert "nothing is proved of what acts here" in bare[0]["why"]
     _, kept, _ = seen(policy="random", steps=4, protect=True)
     assert {e["verdict"] for e in kept} == {"PROOF_APPLIES"}
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_in_a_film_no_proof_applies(monkeypatch, tmp_path):
+    load = Monitor.load
+
+    def patient(name: str) -> Monitor:
+        known = load(name)
+        known.calibration.limits = {name: (-math.inf, math.inf) for name in known.calibration.limits}  # a codec changes textures
+        return known
+
+    monkeypatch.setattr(Monitor, "load", patient)
+    frame = PendulumEnv(batch_size=[1], seed=0).draw(torch.tensor([[0.05, 0.0]]))[0].permute(1, 2, 0).numpy()
+    _, events, _ = seen(video=film(tmp_path / "still.mp4", [frame] * 4), steps=None)
+    assert {e["verdict"] for e in events} == {"INSIDE"}
+    assert all("nothing is proved of what acts here" in e["why"] for e in events)

@@ -221,7 +221,7 @@ class Controller:
         self._applies = self._applies & step.applies
         step.applies = self._applies.clone()  # the caller's, whom a reset of some rows does not reach
         self._memory.expect(predicted, rows)
-        self._last = step.latent, step.action
+        self._last = step.latent, step.action.clone()  # a caller may clip it in place
         return step
 
     def _judged(self, latent: Tensor, innovation: Tensor, seen: Tensor) -> tuple[Step, Tensor]:

@@ -303,7 +303,7 @@ class Monitor:
                 f"expected a time with every picture of a monitor that has a period, and none without, received period={self.period} and "
                 f"time={time}; Monitor(..., period=dt) and step(pixels, time=t) go together"
             )
-        if time is None:
+        if time is None or self.period is None:
             return None
         now = torch.as_tensor(time, dtype=torch.float64, device=fresh.device).expand(self.batch_size).clone()
         before, self._time = self._time, now

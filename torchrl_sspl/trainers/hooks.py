@@ -175,9 +175,10 @@ class FitEncoderHook(_Hook):
             index = torch.linspace(0, len(self.store) - 1, min(self.frames, len(self.store))).long()
             self.encoder.fit(self.store.get(index)["frames"][:, 1])
             delayed = getattr(self.trainer.loss_module, "target_encoder_params", None)
-            for name, value in () if delayed is None else self.trainer.loss_module.encoder_params.items(True, True):
-                if not value.requires_grad:  # a target-network updater follows parameters alone
-                    delayed.get(name).data.copy_(value)
+            if delayed is not None:
+                for name, value in self.trainer.loss_module.encoder_params.items(True, True):
+                    if not value.requires_grad:  # a target-network updater follows parameters alone
+                        delayed.get(name).data.copy_(value)
 
 
 class ClockHook(_Hook):
