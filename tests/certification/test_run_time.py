@@ -113,6 +113,7 @@ def test_corrections_are_held_at_level_zero():
     agent = line_agent(tolerated_error=0.1)
     assert not holds_at(agent, 0.0)
     agent.gain = gain_matrix(0.5, 2)
+    agent.tolerated_error = 0.1  # of this agent
     assert holds_at(agent, 0.0)
     assert not holds_at(agent, -0.1)
 

@@ -28,7 +28,7 @@ def cancelling(**description: Any) -> Agent:
     net[0].bias.data[0] = large
     net[2].weight.data[0] = torch.tensor([0.8, 0.0, 0.0, 0.0])
     net[2].bias.data[0] = -float(net[2].weight[0, 0]) * large
-    agent.tolerated_error = agent.tolerated_error  # of these weights
+    agent.tolerated_error = description["tolerated_error"]  # of these weights
     return agent
 
 
@@ -53,6 +53,7 @@ def test_an_agent_that_tolerates_more_than_is_proved_says_so_or_is_refused(name,
         code, text = verify(tmp_path, env=None)
         assert code == Exit.HOLDS, text
         assert "these layers are not certified: deterministic" in text
+        assert "It says nothing of these layers: statistical, run-time" in text
         return
     forge(body, name)
     verdicts(body)
