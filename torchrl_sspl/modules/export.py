@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from torchrl_sspl.certification.certificate import weights_digest
-from torchrl_sspl.errors import CertificationError, ConfigError, MissingDependencyError
+from torchrl_sspl.errors import CertificationError, ConfigError, MissingDependencyError, SSPLError
 from torchrl_sspl.files import write
 from torchrl_sspl.modules.choosing import ChoosingPolicy
 from torchrl_sspl.modules.controller import correction, meets_premise
@@ -134,20 +134,27 @@ def _about(agent: Any) -> dict[str, Any]:
 
 def _period(agent: Any) -> float | None:
     """Time between two steps in s; None where the agent's description does not say it, and names no system of this library."""
-    from torchrl_sspl import envs
-
     if isinstance(told := agent.description.get("dt"), int | float):
         return float(told)
+    kind, given = _system(agent)
+    period = given.get("dt")
+    if period is None and kind:
+        period = getattr(kind(batch_size=[1]), "dt", None)
+    return float(period) if isinstance(period, (int, float)) else None
+
+
+def _system(agent: Any) -> tuple[Any, dict[str, Any]]:
+    """The class of the system that an agent's description names, None of one that is not of this library; and what it is made with."""
+    from torchrl_sspl import envs
+
     config = agent.description.get("config")
     named = config.get("env") if isinstance(config, Mapping) else None
-    period = named.get("dt") if isinstance(named, Mapping) else None
-    if period is None:
-        target = named.get("_target_") if isinstance(named, Mapping) else None
-        path = target if isinstance(target, str) else f"torchrl_sspl.envs.{agent.description.get('environment')}"
-        kind = getattr(envs, path.rpartition(".")[2], None) if path.startswith("torchrl_sspl.envs.") else None
-        known = isinstance(kind, type) and issubclass(kind, envs.SafetyEnv) and kind is not envs.SafetyEnv
-        period = getattr(kind(batch_size=[1]), "dt", None) if known else None  # type: ignore[misc, call-arg]
-    return float(period) if isinstance(period, (int, float)) else None
+    given = dict(named) if isinstance(named, Mapping) else {}
+    target = given.pop("_target_", None)
+    path = target if isinstance(target, str) else f"torchrl_sspl.envs.{agent.description.get('environment')}"
+    kind = getattr(envs, path.rpartition(".")[2], None) if path.startswith("torchrl_sspl.envs.") else None
+    known = isinstance(kind, type) and issubclass(kind, envs.SafetyEnv) and kind is not envs.SafetyEnv
+    return kind if known else None, given
 
 
 def picture_of(agent: Any) -> tuple[int, int, int]:
@@ -180,15 +187,14 @@ def _steps(agent: Any, n: int, seed: int) -> dict[str, Tensor]:
 def _drawn(agent: Any, n: int, seed: int) -> Tensor | None:
     """Pictures ``(n, 6, H, W)`` of random states, drawn by the system that the agent's description names; None where it names none of this
     library, or one with other pictures."""
-    from torchrl_sspl.evaluation.blocks import described_system
-
-    factory = described_system(agent.description)
-    if factory is None or n < 1:
+    kind, given = _system(agent)
+    try:
+        env = kind(**given | {"batch_size": [1], "seed": seed}) if kind else None
+    except (SSPLError, TypeError, ValueError):  # a description may say anything
+        env = None
+    if env is None or n < 1 or tuple(env.observation_spec["pixels"].shape[1:]) != picture_of(agent):
         return None
-    env, g = factory(batch_size=[1], seed=seed), torch.Generator().manual_seed(seed)
-    if tuple(env.observation_spec["pixels"].shape[1:]) != picture_of(agent):
-        return None
-    state = env.sample_states(n, g)
+    state = env.sample_states(n, torch.Generator().manual_seed(seed))
     return torch.cat([env.draw(env.previous_state(state)), env.draw(state)], 1)
 
 
