@@ -356,7 +356,7 @@ class Policy(nn.Module):
 if __name__ == "__main__":
     from torchrl_sspl.lipschitz import SandwichBarrier
     from torchrl_sspl.modules import LatentDynamics
-    from torchrl_sspl.modules.agent import Agent, load
+    from torchrl_sspl.modules.agent import Agent
 
     nets = Outer.Encoder(2), LatentDynamics(2, 1, (8,)), SandwichBarrier(2, (8,)), Policy(2)
     agent = Agent.from_networks(*nets)

@@ -134,9 +134,10 @@ class SSPLStepper(OptimizationStepper):
     def _look(self, loss: Any, batch: TensorDictBase, terms: TensorDictBase) -> None:
         """The errors of a batch, of those sets that it holds: where there is nothing, nothing is wrong."""
         region = batch[loss.tensor_keys.region]
-        for k, (code, name) in enumerate(((SAFE, "safe_error"), (UNSAFE, "unsafe_error"))):
-            if bool((region == code).any()):
-                self._errors[k] += 0.02 * (float(terms[name]) - self._errors[k])
+        held = torch.stack([(region == code).any() for code in (SAFE, UNSAFE)]).to(terms["safe_error"])
+        for k, (there, error) in enumerate(torch.stack([held, torch.stack([terms["safe_error"], terms["unsafe_error"]])], 1).tolist()):  # waits once
+            if there:
+                self._errors[k] += 0.02 * (error - self._errors[k])
 
     def _clip(self, trainer: Trainer) -> Tensor:
         parameters = [p for group in self.optimizer.param_groups for p in group["params"] if p.grad is not None]
