@@ -173,6 +173,8 @@ def _evaluate(words: list[str]) -> int:
     parser.add_argument("--json", metavar="FILE", help="also write the measurements to this file")
     parser.add_argument("--device", default="cpu", help="device of the networks")
     options = parser.parse_intermixed_args(words)
+    from torchrl_sspl.evaluation.outcome import finite
+
     result = evaluate_agent(options.agent, options.overrides, device=options.device)
     for name, m in result.measurements.items():
         value = "not measured" if m.value is None else f"{m.value:.6g}"
@@ -180,7 +182,7 @@ def _evaluate(words: list[str]) -> int:
         bounds = "" if m.lower is None or m.upper is None else f"  95 % bounds {m.lower:.3g} to {m.upper:.3g}"
         print(f"{name:<32} {value:>12} {m.unit}{size}{bounds}")
     if options.json:
-        write(options.json, json.dumps(result.to_dict(), indent=1, sort_keys=True) + "\n")
+        write(options.json, json.dumps(finite(result.to_dict()), indent=1, sort_keys=True, allow_nan=False) + "\n")
     return 0
 
 

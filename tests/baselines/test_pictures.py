@@ -37,7 +37,7 @@ def test_an_album_draws_once_and_gives_what_the_environment_shows():
     assert torch.equal(first, pooled(env.observe(state)))
     assert torch.equal(torch.cat(list(album(state))), first)
     assert album.drawn == 700
-    assert torch.equal(torch.cat(list(album(state, small=False))), env.observe(state))
+    assert torch.equal(torch.cat(list(album(state, size=None))), env.observe(state))
     assert not torch.equal(torch.cat(list(album(state, "background"))), first)
     tight = Album(env, limit=1 << 20)  # 170 observations of 32 x 32
     for _ in range(2):

@@ -8,7 +8,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from torchrl_sspl.envs import CMUTwoDiscsEnv, DubinsEnv, GymnasiumRenderer, PendulumEnv, Requirement, System
+from torchrl_sspl.envs import (
+    CMUDubinsEnv,
+    CMUTwoDiscsEnv,
+    DubinsEnv,
+    GymnasiumRenderer,
+    PendulumEnv,
+    Requirement,
+    System,
+)
 from torchrl_sspl.envs.dubins import YAW_LAG
 from torchrl_sspl.errors import ConfigError, MissingDependencyError
 
@@ -93,3 +101,17 @@ def test_full_physics_has_the_regions_and_actions_of_the_car():
             assert (info["safe"], info["unsafe"]) == (region == 1, region == 2)
     finally:
         world.close()
+
+
+@pytest.mark.parametrize("kind", [PendulumEnv, DubinsEnv, CMUDubinsEnv, CMUTwoDiscsEnv])
+def test_a_moved_system_keeps_its_states_and_makes_its_pictures_anew(kind):
+    env = kind(batch_size=[2], seed=0)
+    shown = env.reset()
+    held = {k: v for k, v in vars(env).items() if k in ("_renderer", "_compositor", "_picture")}
+    assert env.to("cpu:0") is env  # TorchRL takes it for another device than "cpu"
+    assert not any(vars(env).get(k) is v for k, v in held.items())
+    assert torch.equal(env._state, shown["state"])
+    again = env.reset(shown.select("state"), set_state=True)
+    assert torch.equal(again["pixels"], shown["pixels"])
+    with pytest.raises(ConfigError, match="device: expected a device"):
+        env.to("cuda:99")

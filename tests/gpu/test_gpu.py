@@ -23,7 +23,7 @@ from torchrl_sspl import certify, evaluate, load
 from torchrl_sspl.certification import Budget
 from torchrl_sspl.configs import EvaluationConfig, compose
 from torchrl_sspl.data import TransitionStore, collect_random
-from torchrl_sspl.envs import DubinsEnv, PendulumEnv
+from torchrl_sspl.envs import CMUDubinsEnv, CMUTwoDiscsEnv, DubinsEnv, PendulumEnv
 from torchrl_sspl.evaluation import certify_on_episodes, evaluate_episodes, simulate
 from torchrl_sspl.evaluation.known import encode_states, latency
 from torchrl_sspl.experiments.run import Experiment
@@ -52,6 +52,21 @@ JOINT = [
     "evaluation.episodes=8", "evaluation.horizon=4", "evaluation.grid=7", "evaluation.kernel_grid=31",
     "evaluation.renderer_episodes=0", "synthesis.enabled=false",
 ]  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [PendulumEnv, DubinsEnv, CMUDubinsEnv, CMUTwoDiscsEnv])
+def test_an_environment_that_is_moved_goes_on_on_the_device(kind):
+    env = kind(batch_size=[2], seed=0)
+    shown = env.reset()
+    moved = env.to("cuda")
+    assert moved is env
+    assert env.device.type == "cuda"
+    stayed = TensorDict({"state": shown["state"].cuda()}, [2], device="cuda")
+    again = env.reset(stayed, set_state=True)
+    assert (again["pixels"].cpu().int() - shown["pixels"].int()).abs().float().mean() < 1.0
+    after = env.rollout(3, break_when_any_done=False)
+    assert after["next", "pixels"].is_cuda
+    assert after["next", "state"].is_cuda
 
 
 def make_loss() -> SSPLLoss:

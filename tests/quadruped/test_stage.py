@@ -28,7 +28,7 @@ def bodies():
 
 @pytest.mark.slow
 def test_another_process_draws_the_same_pictures_of_every_job_in_whatever_order_they_are_asked_for(bodies):
-    options = {"obstacle_half_size": 0.2, "areas": [(2.0, (0.0, 0.0), (10, 20, 30))]}
+    options = {"obstacle_half_size": 0.2, "areas": [("square", 2.0, (0.0, 0.0), (10, 20, 30))]}
     here, there = Stage(48, **options), StageProcess(48, **options)
     first, second = there.follow(bodies, 0.02), there.follow(bodies[::-1], 0.02)
     for drawn, job in ((second, bodies[::-1]), (first, bodies)):

@@ -49,6 +49,8 @@ class Budget:
         return self.transitions + self.safe + self.unsafe + self.rollouts
 
 
+SCHEMA = 3  # one more where recordings, encoders or measures have changed: what was measured before is not taken
+POOL = 32  # height and width to which pictures are averaged, unless a method has an option for it
 EARLIER = "earlier_cpu_seconds"  # note of a method whose training goes on where another process stopped
 #: Small: one recording. Full: more than the shipped agents took, with rollouts. Tiny: for tests.
 BUDGETS = {
@@ -113,7 +115,7 @@ class SafetyMethod(ABC):
         reads: ``"pixels"``, two stacked frames uint8 ``(n, 6, H, W)``, or ``"state"``, true states ``(n, s)``.
         learns: whether budget and seed matter.
         records: whether ``fit`` takes a recording.
-        pools: whether pictures are averaged for it to the size that the rivals share.
+        pools: whether pictures are averaged for it, see :attr:`side`.
         needs: what it was given, complete after ``fit``.
         notes: figures of its own training.
         directory: where a training of its own may write; None: nowhere.
@@ -168,6 +170,11 @@ class SafetyMethod(ABC):
         found, state = self.stages[key]
         torch.set_rng_state(state)
         return found
+
+    @property
+    def side(self) -> int | None:
+        """Height and width to which pictures are averaged for it: its option ``pixels``, else what rivals share; None: it sees them as they are."""
+        return getattr(self.config, "pixels", POOL) if self.pools else None
 
     @classmethod
     def idle(cls, env: SafetyEnv) -> tuple[str, ...]:

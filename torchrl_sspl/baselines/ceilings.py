@@ -185,7 +185,7 @@ class LQREllipsoid(Ceiling):
     .. math:: h(x) = x^\top P x - c, \qquad P = A^\top P A - A^\top P B (R + B^\top P B)^{-1} B^\top P A + Q
 
     The level c is the largest for which a fine grid of the border stays outside U and is led inwards by
-    :math:`u = \operatorname{sat}(-K x)`. Raises SolverError if the Riccati equation has no solution. Source: textbook.
+    :math:`u = \operatorname{sat}(-K x)`. Raises SolverError if the Riccati equation has no positive definite solution. Source: textbook.
     """
 
     name = "lqr"
@@ -201,8 +201,9 @@ class LQREllipsoid(Ceiling):
         q, r = np.diag(self.config.state_weight), np.array([[self.config.action_weight]])
         try:
             p = solve_discrete_are(a, b, q, r)
+            np.linalg.cholesky(p)
         except (ValueError, np.linalg.LinAlgError) as error:
-            raise SolverError(f"lqr: expected a solution of the Riccati equation, received {error}; choose other weights") from error
+            raise SolverError(f"lqr: expected a positive definite solution of the Riccati equation, received {error}; choose other weights") from error
         self.p = torch.from_numpy(p).float()
         self.k = torch.from_numpy(np.linalg.solve(r + b.T @ p @ b, b.T @ p @ a)).float()
         self.level = self._level()

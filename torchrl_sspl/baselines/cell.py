@@ -20,7 +20,7 @@ import yaml
 from filelock import FileLock
 
 from torchrl_sspl.baselines import tuning
-from torchrl_sspl.baselines.base import BUDGETS, EARLIER, SafetyMethod
+from torchrl_sspl.baselines.base import BUDGETS, EARLIER, POOL, SCHEMA, SafetyMethod
 from torchrl_sspl.baselines.data import Recording, record
 from torchrl_sspl.baselines.pictures import Album
 from torchrl_sspl.baselines.registry import changed, kind_of, make
@@ -35,7 +35,6 @@ from torchrl_sspl.viability.grid import ViabilityKernel, viability_kernel
 
 ROW_FILE, CLAIMS_FILE, TRIALS_FILE = "row.json", "claims.npz", "trials.json"
 STAYS = "rows and trials that are done stay; the same command goes on from there"
-SCHEMA = 3  # one more where recordings, encoders or measures have changed: what was measured before is not taken
 _OWN = ("env", "budget", "seed", "out_dir", "trials")
 
 
@@ -87,8 +86,8 @@ class Cell:
         if own.get("budget", "small") not in BUDGETS:
             raise ConfigError(f"expected budget to be one of {', '.join(BUDGETS)}, received '{own['budget']}'")
         for number in ("seed", "trials"):
-            if not own.get(number, "0").isdigit():
-                raise ConfigError(f"expected {number} to be an integer >= 0, received '{own[number]}'")
+            if not own.get(number, "0").isdecimal() or int(own.get(number, "0")) >= 2**62:
+                raise ConfigError(f"expected {number} to be an integer in [0, 2^62), received '{own[number]}'")
         if int(own.get("trials", 0)) and int(own.get("seed", 0)) == tuning.SEED:
             raise ConfigError(f"expected another seed than {tuning.SEED} with trials, which are made with that one, received it")
         sizes: Any = changed(ScoreConfig, scores, "expected score.*")
@@ -174,13 +173,13 @@ def stored(cell: Cell, *, any_score: bool = False) -> dict[str, Any] | None:
     if not path.is_file():
         return None
     row = of_this_version(_read(path, "a row"), path)
-    found = row.get("cell") or {}
-    if found.get("weights") != cell.describe().get("weights"):
+    found, now = row.get("cell") or {}, cell.describe()
+    if found.get("weights") != now.get("weights") and {**found, "weights": None, "score": None} == {**now, "weights": None, "score": None}:
         return None
-    if found.get("system") != (now := cell.describe().get("system")) and {**found, "system": now} == cell.describe():
+    if found.get("system") != now.get("system") and {**found, "system": now.get("system")} == now:
         raise OutputError(f"expected the row of '{cell.env}' as it is in '{path}', found that of an earlier content of the file; remove it, or choose another out_dir")
-    if {**found, "score": None} != {**cell.describe(), "score": None} or not (any_score or found["score"] == cell.describe()["score"]):
-        raise OutputError(f"expected the row of {cell.describe()} in '{path}', found that of {row.get('cell')}; remove it, or choose another out_dir for one row")
+    if {**found, "score": None} != {**now, "score": None} or not (any_score or found["score"] == now["score"]):
+        raise OutputError(f"expected the row of {now} in '{path}', found that of {row.get('cell')}; remove it, or choose another out_dir for one row")
     return row
 
 
@@ -207,9 +206,9 @@ def _read(path: Path, what: str) -> dict[str, Any]:
 
 
 @functools.lru_cache(maxsize=1)
-def _recorded(env: str, system: str, budget: str, seed: int) -> Recording:
-    """One recording serves all methods of a system, a budget and a seed; ``system`` is the hash of its file."""
-    return record(Cell("kernel", env, seed=seed).environment(), BUDGETS[budget], seed)
+def _recorded(env: str, system: str, budget: str, seed: int, size: int) -> Recording:
+    """One recording serves all methods of a system, a budget, a seed and a size of the pictures; ``system`` is the hash of its file."""
+    return record(Cell("kernel", env, seed=seed).environment(), BUDGETS[budget], seed, size=size)
 
 
 @functools.lru_cache(maxsize=2)
@@ -227,7 +226,7 @@ def _album(env: str, system: str) -> Album:
 
 def _fit(method: SafetyMethod, env: SafetyEnv, cell: Cell, seed: int) -> None:
     """The method of a cell learns from the data of a seed."""
-    data = _recorded(cell.env, hash_of(cell.env), cell.budget, seed) if method.learns and method.records else None
+    data = _recorded(cell.env, hash_of(cell.env), cell.budget, seed, method.side or POOL) if method.learns and method.records else None
     with torch.random.fork_rng():
         torch.manual_seed(spawn(seed, "weights"))
         method.fit(data, env, BUDGETS.get(cell.budget, BUDGETS["tiny"]), seed)
@@ -295,7 +294,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         method.directory, method.env_name = directory, cell.env
         clock = [time.perf_counter()]
         if method.learns and method.records:
-            _recorded(cell.env, system, cell.budget, cell.seed)
+            _recorded(cell.env, system, cell.budget, cell.seed, method.side or POOL)
         clock.append(time.perf_counter())
         used = time.process_time()
         _fit(method, env, cell, cell.seed)

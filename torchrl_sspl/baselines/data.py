@@ -9,14 +9,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from torchrl_sspl.baselines.base import Budget
+from torchrl_sspl.baselines.base import POOL, Budget
 from torchrl_sspl.data import TransitionStore, collect_random
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError, DTypeError, ShapeError
 from torchrl_sspl.seeds import spawn
 from torchrl_sspl.sets import SAFE, UNSAFE, Mixture, Region
 
-POOL = 32  # height and width to which pictures are averaged for every learned method
 STEPS = 4  # longest episode, as in this library's own training
 _CHUNK, _ENVS = 2048, 256
 _PART = 64  # pictures that are averaged at a time; they stay in the cache
@@ -124,7 +123,7 @@ def record(env: SafetyEnv, budget: Budget, seed: int, *, size: int = POOL) -> Re
         seed: of states and actions.
         size: height and width of the pictures that are kept.
 
-    Raises ConfigError if the budget is empty. Source: the data sets D, S and U of the paper, Section IV.
+    Raises ConfigError if the budget is empty, or the system's pictures are smaller. Source: the data sets D, S and U of the paper, Section IV.
 
     Example:
         >>> from torchrl_sspl.baselines.base import Budget
@@ -133,6 +132,8 @@ def record(env: SafetyEnv, budget: Budget, seed: int, *, size: int = POOL) -> Re
         >>> len(found), found.count(SAFE) >= 8, found.frames.shape
         (40, True, torch.Size([40, 3, 3, 32, 32]))
     """
+    if size > env.image_size:
+        raise ConfigError(f"pixels: expected at most {env.image_size}, the size of the system's pictures, received {size}")
     outside = env.state_space - env.unsafe_set
     plan: list[tuple[int, Region]] = [
         (budget.transitions + budget.rollouts, Mixture([env.state_space, outside], [0.5, 0.5])),

@@ -119,7 +119,7 @@ class Imitation(SafetyMethod):
             def loss(rows: Tensor, seen: Tensor = seen, wanted: Tensor = wanted) -> dict[str, Tensor]:
                 return {"loss": ((self.network(seen[rows]) - wanted[rows]) / self.scale).square().mean()}
 
-            loop = train(seed + k, self.config.steps // (rounds + 1), {self.network: 3e-3}, loss, len(seen))
+            loop = train(seed + k, max(1, self.config.steps // (rounds + 1)), {self.network: 3e-3}, loss, len(seen))
         self.network.eval()
         self.notes["loss"] = float(loop.loss or 0.0)
         self.needs = Needs(

@@ -21,7 +21,7 @@ from tensordict import TensorDict
 from torch import Tensor, nn
 
 from torchrl_sspl.baselines.base import Budget, Needs, SafetyMethod
-from torchrl_sspl.baselines.data import Recording, pooled
+from torchrl_sspl.baselines.data import POOL, Recording, pooled
 from torchrl_sspl.baselines.perception import encoder_for, train
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.errors import ConfigError
@@ -48,6 +48,7 @@ class LatentSafeConfig:
     threshold: float = 0.0  # eps of the filter
     batch: int = 256
     layers: int = 2  # of Q, 128 units each
+    pixels: int = POOL  # height and width to which pictures are averaged; what this library's own agent sees is 64, of CMU's cars 128
 
 
 class LatentSafe(SafetyMethod):
@@ -68,16 +69,12 @@ class LatentSafe(SafetyMethod):
     def fit(self, data: Recording, env: SafetyEnv, budget: Budget, seed: int) -> None:
         """World model, margin, value, one after the other; see :meth:`SafetyMethod.fit`."""
         c = self.config
-        if not 0.0 <= c.discount < 1.0:
-            raise ConfigError(f"{self.name}: expected discount in [0, 1), received {c.discount}")
-        if not 0.0 <= c.warmup < 1.0:
-            raise ConfigError(f"{self.name}: expected warmup in [0, 1), received {c.warmup}")
         if env.action_dim != 1:
             raise ConfigError(f"{self.name}: expected a system of one action, received {type(env).__name__} with {env.action_dim}; take a method of another kind")
         self.env = env
         failed = data.region == UNSAFE
         region = torch.where(failed, UNSAFE, SAFE)
-        self.encoder, self.dynamics, self.notes["world_loss"] = self.stage(("latent", "world_steps"), lambda: self._world(data, region, seed))
+        self.encoder, self.dynamics, self.notes["world_loss"] = self.stage(("latent", "world_steps", "pixels"), lambda: self._world(data, region, seed))
         with torch.no_grad():
             z = torch.cat([self.encoder(part) for part in data.pixels.split(500)])
         self.margin = nn.Sequential(mlp((z.shape[1], 64, 64, 64, 1), nn.SiLU))
@@ -98,7 +95,7 @@ class LatentSafe(SafetyMethod):
         size = c.latent if env.state_dim > 2 else c.latent - 1
         encoder = encoder_for(env, size, data)
         size = encoder.latent_dim
-        dynamics = LatentDynamics(size, env.action_dim, (96, 96), env.max_action)
+        dynamics = LatentDynamics(size, env.action_dim, (96, 96), env.max_action, turn_radius=getattr(encoder, "turn_radius", 0.0))
         salad = SaLaDLoss(
             None, dynamics, mlp((size, 64, 64, 1), nn.SiLU), consistency="online", safety_margin=0.3, safe_coeff=0.3, unsafe_coeff=0.3,
             consistency_coeff=2.0, inverse_dynamics_coeff=1.0, variance_coeff=0.5, covariance_coeff=0.5, saturation_coeff=0.3,

@@ -67,7 +67,7 @@ class NeuralCBFConfig:
     rate: float = 1.0  # alpha of the condition, 1/s
     margin: float = 0.1  # gamma_1 of the hinges on S and U
     hinge: float = 100.0  # weight of the hinges beside the condition's 10: a door in U costs the mean over U little
-    slack: float = 0.01  # gamma_2 of the condition
+    slack: float = 0.01  # gamma_2 of the condition, per step
     alpha: float = 0.95  # share of h that a step of the filter has to leave
     offset: float = 0.0  # added to -h, in claim and filter
     batch: int = 512

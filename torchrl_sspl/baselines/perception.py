@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor, nn
 
-from torchrl_sspl.baselines.data import POOL, Recording, pooled
+from torchrl_sspl.baselines.data import Recording, pooled
 from torchrl_sspl.envs.base import SafetyEnv, wrapped
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
@@ -81,7 +81,7 @@ def encoder_for(env: SafetyEnv, size: int, data: Recording, *, whole: bool = Fal
     elif isinstance(env, CMUTwoDiscsEnv):
         encoder = ShapePlaceEncoder(max(size, 4), pool_to=side)
     else:
-        return FrameEncoder(size, pool_to=POOL)
+        return FrameEncoder(size, pool_to=side)
     rows = torch.arange(len(data))[:: max(1, len(data) // 2000)]
     encoder.fit(data.frames[rows, 1])  # type: ignore[operator]
     return encoder

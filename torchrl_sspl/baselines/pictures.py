@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from torchrl_sspl.baselines.data import pooled
+from torchrl_sspl.baselines.data import POOL, pooled
 from torchrl_sspl.envs.base import SafetyEnv
 from torchrl_sspl.envs.cmu_dubins import CMUDubinsEnv
 from torchrl_sspl.envs.dubins import DubinsEnv
@@ -121,32 +121,32 @@ class Album:
 
     def __init__(self, env: SafetyEnv, limit: int = 512 << 20) -> None:
         self.env, self.limit, self.drawn = env, limit, 0
-        self._kept: OrderedDict[tuple[str, bool, bytes], list[Tensor]] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, int | None, bytes], list[Tensor]] = OrderedDict()
 
-    def __call__(self, state: Tensor, shift: str = "", *, small: bool = True) -> Any:
-        """Observations uint8 ``(k, 6, H, W)`` of states ``(n, s)``, some at a time; ``small``: averaged as methods are given them."""
-        key = (shift, small, sha256(state.contiguous().numpy().tobytes()).digest())
+    def __call__(self, state: Tensor, shift: str = "", *, size: int | None = POOL) -> Any:
+        """Observations uint8 ``(k, 6, H, W)`` of states ``(n, s)``, some at a time, averaged to a ``size``; None: as they are."""
+        key = (shift, size, sha256(state.contiguous().numpy().tobytes()).digest())
         if key in self._kept:
             self._kept.move_to_end(key)
             yield from self._kept[key]
             return
         kept: list[Tensor] = []
-        size = 0
+        held = 0
         for part in state.split(_ROWS):
-            seen = self._draw(part, shift, small)
-            size += seen.nbytes
-            kept = [*kept, seen] if size <= self.limit else []
+            seen = self._draw(part, shift, size)
+            held += seen.nbytes
+            kept = [*kept, seen] if held <= self.limit else []
             yield seen
-        if size <= self.limit:
+        if held <= self.limit:
             self._kept[key] = kept
             while sum(t.nbytes for parts in self._kept.values() for t in parts) > self.limit:
                 self._kept.popitem(last=False)
 
-    def _draw(self, state: Tensor, shift: str, small: bool) -> Tensor:
+    def _draw(self, state: Tensor, shift: str, size: int | None) -> Tensor:
         draw = shifts(self.env)[shift] if shift else self.env.draw
         self.drawn += len(state)
         frames = [draw(x) for x in (self.env.previous_state(state), state)]
-        return torch.cat([pooled(f) for f in frames] if small else frames, 1)
+        return torch.cat(frames if size is None else [pooled(f, size) for f in frames], 1)
 
 
 __all__ = ["Album", "recoloured", "shifts"]

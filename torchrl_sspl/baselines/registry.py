@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import yaml
@@ -35,6 +35,14 @@ METHODS = {
 }
 
 
+#: Options of one meaning, by name, what is expected of them, and whether a value is valid.
+_RANGES: tuple[tuple[tuple[str, ...], str, Callable[[float], bool]], ...] = (
+    (("alpha", "discount", "warmup"), "in [0, 1)", lambda v: 0 <= v < 1),
+    (("tau", "keep"), "in (0, 1]", lambda v: 0 < v <= 1),
+    (("beta", "radius", "rate", "slack", "hinge", "penalty", "plain"), ">= 0", lambda v: v >= 0),
+)
+
+
 def kind_of(name: str) -> type[SafetyMethod]:
     """Class of a method; a ConfigError that lists all if there is none of that name. Source: none.
 
@@ -61,6 +69,10 @@ def make(name: str, options: Sequence[str] = ()) -> SafetyMethod:
             raise ConfigError(f"{name}: expected no options, received {list(options)}")
         return kind()
     config = changed(kind.Config, options, f"{name}: expected options")
+    for keys, words, valid in _RANGES:
+        for key in keys:
+            if not valid(value := getattr(config, key, 0.5)):
+                raise ConfigError(f"{name}: expected {key} {words}, received {value}")
     for key, usual in vars(kind.Config()).items():
         value, least = getattr(config, key), min(1, usual) if type(usual) is int else -math.inf
         if isinstance(value, (int, float)) and not least <= value < math.inf:

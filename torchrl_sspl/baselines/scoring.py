@@ -36,7 +36,7 @@ class ScoreConfig:
     """Sizes of the measurements."""
 
     episodes: int = 0  # of each of the four blocks; 0: 500, of methods on states and on pictures alike
-    horizon: int = 0  # steps of each; 0: 200
+    horizon: int = 0  # steps of each; 0: 200, of trials 60
     grid: int = 0  # states along the finest coordinate of the grid of the sets; 0: the system's own
     kernel_grid: int = 0  # the same of the true kernel's grid
     check_episodes: int = 0  # that place a calibrated level; 0: as many as episodes
@@ -45,7 +45,9 @@ class ScoreConfig:
     seed: int = 20260104  # of the starts
 
     def check(self) -> None:
-        """Raises ConfigError for a size with which nothing can be measured."""
+        """Raises ConfigError for a size with which nothing can be measured, or a seed that is none."""
+        if not 0 <= self.seed < 2**62:
+            raise ConfigError(f"score.seed: expected an integer in [0, 2^62), received {self.seed}")
         for name, value in vars(self).items():
             least = 1 if name == "frames" else 2 if name in ("grid", "kernel_grid") and value else 0
             if not value >= least:
@@ -136,7 +138,7 @@ def barrier_on(method: SafetyMethod, env: SafetyEnv, state: Tensor, album: Album
         True
     """
     values = []
-    for seen in [state] if method.reads == "state" else (album or Album(env))(state, shift, small=method.pools):
+    for seen in [state] if method.reads == "state" else (album or Album(env))(state, shift, size=method.side):
         value = method.barrier(seen)
         if value is None:
             return None
@@ -161,7 +163,7 @@ def paths(
     acts = method.controller(nominal)
     # Each frame is averaged once, not with every observation that holds it.
     frame = draw or env.draw
-    run = simulate(acts, env, start=start, horizon=horizon, draw=(lambda state: pooled(frame(state))) if method.pools else frame)
+    run = simulate(acts, env, start=start, horizon=horizon, draw=frame if (side := method.side) is None else lambda state: pooled(frame(state), side))
     assert run.states is not None
     return acts, ((run.region == UNSAFE) & run.alive).any(0), run.states
 

@@ -18,12 +18,12 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from torchrl_sspl.baselines.base import EARLIER, Budget, Guarded, Needs, Nominal, SafetyMethod
+from torchrl_sspl.baselines.base import EARLIER, SCHEMA, Budget, Guarded, Needs, Nominal, SafetyMethod
 from torchrl_sspl.configs.reader import compose
 from torchrl_sspl.configs.schema import Config
 from torchrl_sspl.envs import DubinsEnv, PendulumEnv
 from torchrl_sspl.envs.base import SafetyEnv
-from torchrl_sspl.errors import ConfigError
+from torchrl_sspl.errors import ConfigError, OutputError
 from torchrl_sspl.evaluation.controllers import AgentController, Camera
 from torchrl_sspl.experiments.run import Experiment
 from torchrl_sspl.files import write
@@ -31,7 +31,7 @@ from torchrl_sspl.modules.agent import Agent, agent_directory, load
 from torchrl_sspl.runtime.filter import LEVEL, UNPROVED_MARGIN, Shield
 from torchrl_sspl.trainers.phases import Check
 
-CPU_FILE = "cpu.json"  # of a training: s of the processor
+CPU_FILE = "cpu.json"  # of a training: s of the processor, and the schema of the version that began it
 BUDGET_FILE = "budget.json"  # of a training: what was counted of its data
 # The score's pictures have no noise to be steady under, and an error of one step adds up in a memory alone.
 _PLAIN = ["augmentation.share=0.0", "synthesis.steady_steps=0", "synthesis.dynamics_steps=1500", "synthesis.unsafe_margin=0.05"]
@@ -179,14 +179,24 @@ class SSPL(SafetyMethod):
 
     @contextmanager
     def _timed(self, path: Path) -> Iterator[None]:
-        """Notes the CPU time that earlier processes took of a training which goes on, and keeps that of all beside it."""
-        before = json.loads(path.read_text())["seconds"] if path.is_file() else 0.0
-        begun = time.process_time()
+        """Notes the CPU time that earlier processes took of a training which goes on, and keeps that of all beside it.
+
+        An OutputError if they were of a version with other recordings or encoders.
+        """
+        told = json.loads(path.read_text()) if path.is_file() else {"schema": SCHEMA, "seconds": 0.0}
+        if told.get("schema") != SCHEMA:
+            raise OutputError(f"expected a training of schema {SCHEMA} in '{path.parent}', found one of another version of this library; remove that folder, and it is trained anew")
+        before, begun = told["seconds"], time.process_time()
         self.notes[EARLIER] = before
+
+        def keep() -> None:
+            write(path, json.dumps({"schema": SCHEMA, "seconds": before + time.process_time() - begun}) + "\n")
+
+        keep()
         try:
             yield
         finally:
-            write(path, json.dumps({"seconds": before + time.process_time() - begun}) + "\n")
+            keep()
 
     def barrier(self, seen: Tensor) -> Tensor | None:
         """The barrier of what is seen, without a memory."""

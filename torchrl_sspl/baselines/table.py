@@ -96,7 +96,8 @@ def cells(words: Sequence[str]) -> list[Cell]:
                 budget = "small"  # a name alone: nothing is learnt with it
             cell = Cell.of(method, [f"env={env}", f"budget={budget}", f"seed={seed}", f"trials={given.get('trials', '0')}", *options, *scores])
             cell = replace(cell, root=given.get("out_dir") or cell.root)
-            found[cell.directory] = cell
+            if found.setdefault(cell.directory, cell) != cell:
+                raise ConfigError(f"table: expected cells of folders of their own, received two for '{cell.directory}': {found[cell.directory].describe()} and {cell.describe()}; ask for one after the other, with another out_dir")
     return list(found.values())
 
 
@@ -119,7 +120,7 @@ def table(words: Sequence[str]) -> list[tuple[Cell, Row]]:
     """
     given = parse(list(words))
     run, jobs = given.pop("run", "true"), given.pop("jobs", "1")
-    if run not in ("true", "false") or not jobs.isdigit() or not int(jobs):
+    if run not in ("true", "false") or not jobs.isdecimal() or not int(jobs):
         raise ConfigError(f"table: expected run=true or false and jobs >= 1, received run={run} and jobs={jobs}")
     asked, measure, found = cells([f"{k}={v}" for k, v in given.items()]), partial(_row, run=run == "true"), list[tuple[Cell, Row]]()
     rows = _side_by_side(measure, asked, int(jobs)) if run == "true" and int(jobs) > 1 else map(measure, asked)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -42,6 +43,14 @@ def check_positive(**values: float) -> None:
     for name, value in values.items():
         if not isinstance(value, (int, float)) or not math.isfinite(value) or value <= 0:
             raise ConfigError(f"{name}: expected a positive finite number, received {value!r}.")
+
+
+def numbers(values: Any) -> tuple[float, ...]:
+    """Values as numbers; without any for what holds none, for whoever asks how many they are."""
+    try:
+        return tuple(float(v) for v in values)
+    except (TypeError, ValueError):
+        return ()
 
 
 def wrapped(angle: Tensor) -> Tensor:
@@ -124,9 +133,15 @@ class SafetyEnv(EnvBase):
         device: torch.device | str | None = None,
         seed: int | None = None,
     ) -> None:
-        batch_size = torch.Size([batch_size]) if isinstance(batch_size, int) else torch.Size(batch_size)
-        if len(batch_size) > 1 or any(n < 1 for n in batch_size):
-            raise ConfigError(f"batch_size: expected [n] with n >= 1, or [], received {list(batch_size)}.")
+        try:
+            size = torch.Size([batch_size] if isinstance(batch_size, int) else batch_size)
+        except TypeError:
+            size = torch.Size([0])
+        if len(size) > 1 or any(n < 1 for n in size):
+            raise ConfigError(f"batch_size: expected [n] with n >= 1, or [], received {batch_size!r}.")
+        batch_size = size
+        if seed is not None and not isinstance(seed, int):
+            raise ConfigError(f"seed: expected an integer or None, received {seed!r}.")
         if horizon is not None and (not isinstance(horizon, int) or horizon < 1):
             raise ConfigError(f"horizon: expected an integer >= 1 or None, received {horizon!r}.")
         check_positive(max_action=max_action)
@@ -231,6 +246,24 @@ class SafetyEnv(EnvBase):
     def action_high(self) -> Tensor:
         """Largest action ``(action_dim,)``."""
         return torch.full((self.action_dim,), self.max_action, device=self.device)
+
+    def to(self, device: torch.device | str) -> SafetyEnv:
+        """The environment itself, moved to a device with its systems as they are; from there on resets are of another random stream.
+
+        A system of your own that keeps tensors moves them here too, or draws from ``cached_property``, which are made anew.
+        Raises ConfigError for a device that is not there.
+        """
+        before = self.device
+        super().to(usable_device(device))
+        if self.device == before:
+            return self
+        seed = int(torch.randint(2**62, (), generator=self._generator, device=before))
+        self._generator = torch.Generator(device=self.device).manual_seed(seed)
+        self._state, self._frame, self._steps = (x.to(self.device) for x in (self._state, self._frame, self._steps))
+        for kind in type(self).__mro__:
+            for name in [n for n, value in vars(kind).items() if isinstance(value, functools.cached_property)]:
+                self.__dict__.pop(name, None)
+        return self
 
     def clamp_action(self, action: Tensor) -> Tensor:
         """Check an action ``(*batch, action_dim)`` and clamp it to the bounds."""

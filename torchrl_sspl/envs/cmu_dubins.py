@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 
@@ -9,7 +10,7 @@ import gymnasium
 import torch
 from torch import Tensor
 
-from torchrl_sspl.envs.base import check_positive, check_tensor
+from torchrl_sspl.envs.base import check_positive, check_tensor, numbers
 from torchrl_sspl.envs.dubins import DubinsEnv
 from torchrl_sspl.envs.system import Requirement, System
 from torchrl_sspl.errors import ConfigError
@@ -20,10 +21,10 @@ _POINT = 1 / 72  # of the width of the frame, which is one inch
 _LINE = 1.0 * _POINT  # width of outlines
 _LINES = 4  # per row of pixels, on which the extent of the arrow is exact
 _CHUNK = 128  # frames at a time
-# Of all states that cannot be kept safe, 28 % lie outside U: 10.8 % and 3.6 % of these are 3 % and 1 % of all.
+# Of all states that cannot be kept safe, 30.7 % lie outside U: 9.7 % and 3.2 % of these are less than 3 % and 1 % of all.
 _REQUIREMENTS = (
     Requirement("volume_over_kernel", "volume of {B <= 0} over the true kernel (recall)", ">=", 0.95, 0.97),
-    Requirement("false_safe_of_doomed", "doomed states outside U with B <= 0", "<=", 0.108, 0.036),
+    Requirement("false_safe_of_doomed", "doomed states outside U with B <= 0", "<=", 0.097, 0.032),
     Requirement("unsafe_called_safe", "grid of U with B <= 0", "<=", 0.0, 0.0),
     Requirement("safe_rollouts_touch_unsafe", "episodes from {B <= 0} that enter U", "<=", 0.001, 0.0),
     Requirement("training_minutes", "training time [min]", "<=", 20.0, 10.0),
@@ -100,7 +101,7 @@ class CMUDubinsEnv(DubinsEnv):
         seed: int | None = None,
     ) -> None:
         check_positive(arrow_scale=arrow_scale, arrow_width=arrow_width)
-        if not 0 <= dot_area < math.inf:
+        if not isinstance(dot_area, (int, float)) or not 0 <= dot_area < math.inf:
             raise ConfigError(f"dot_area: expected a finite number >= 0, received {dot_area!r}.")
         super().__init__(
             batch_size, YAW_RATE, speed=SPEED, dt=STEP, image_size=image_size, arena_half_size=ARENA,
@@ -111,7 +112,11 @@ class CMUDubinsEnv(DubinsEnv):
         self.arrow_scale, self.arrow_width, self.dot_area = float(arrow_scale), float(arrow_width), float(dot_area)
         self.background, self.obstacle_colour = _colour("background", background), _colour("obstacle_colour", obstacle_colour)
         self.car_colour = _colour("car_colour", car_colour)
-        self._picture = _Picture(self)
+        _ = self._picture
+
+    @functools.cached_property
+    def _picture(self) -> _Picture:
+        return _Picture(self)
 
     @property
     def system(self) -> System:
@@ -144,9 +149,9 @@ class CMUDubinsEnv(DubinsEnv):
 
 
 def _colour(name: str, value: Colour) -> tuple[float, float, float]:
-    colour = tuple(float(v) for v in value)
+    colour = numbers(value)
     if len(colour) != 3 or not all(0 <= v <= 1 for v in colour):
-        raise ConfigError(f"{name}: expected red, green and blue in [0, 1], received {list(value)}.")
+        raise ConfigError(f"{name}: expected red, green and blue in [0, 1], received {value!r}.")
     return colour  # type: ignore[return-value]
 
 

@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Any
 
 import gymnasium
 import torch
 from torch import Tensor
 
-from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor, wrapped
+from torchrl_sspl.envs.base import SafetyEnv, check_positive, check_tensor, numbers, wrapped
 from torchrl_sspl.envs.quadruped.arena import check_arena, half_view
 from torchrl_sspl.envs.quadruped.compositor import TopViewCompositor
 from torchrl_sspl.envs.system import Opening, Requirement, System
@@ -185,7 +185,7 @@ class DubinsEnv(SafetyEnv):
             arena_half_size=arena_half_size, safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size,
             obstacle_shape=obstacle_shape, obstacle_half_size=obstacle_half_size, obstacle_centre=obstacle_centre,
         )  # fmt: skip
-        if yaw_lag is not None and (len(yaw_lag) != 2 or not all(math.isfinite(v) for v in yaw_lag)):
+        if yaw_lag is not None and (len(lag := numbers(yaw_lag)) != 2 or not all(map(math.isfinite, lag))):
             raise ConfigError(f"yaw_lag: expected two finite numbers (a, b) in s or None, received {yaw_lag!r}.")
         turn = 2 * math.pi
         # Coordinates other than the position: heading, and with a lag the last command.
@@ -213,7 +213,11 @@ class DubinsEnv(SafetyEnv):
         self.safe_half_size, self.unsafe_half_size = float(safe_half_size), float(unsafe_half_size)
         self.obstacle = obstacle  # what stands on the ground, a set of (x, y)
         self.half_view = half_view(self.arena_half_size)
-        self._compositor = TopViewCompositor(image_size, obstacle=obstacle, half_view=self.half_view, device=self.device)
+        _ = self._compositor  # a size that is not valid is named at once
+
+    @functools.cached_property
+    def _compositor(self) -> TopViewCompositor:
+        return TopViewCompositor(self.image_size, obstacle=self.obstacle, half_view=self.half_view, device=self.device)
 
     @property
     def system(self) -> System:
@@ -273,7 +277,7 @@ class DubinsEnv(SafetyEnv):
             raise MissingDependencyError(
                 f"full physics: expected the simulator, received {error}; pip install 'torchrl-sspl[quadruped]'."
             ) from error
-        return partial(QuadrupedEnv, **self._geometry())
+        return functools.partial(QuadrupedEnv, **self._geometry())
 
     def _geometry(self) -> dict[str, Any]:
         """What this car, its twin and the robot in full physics have in common, as keyword arguments of theirs."""

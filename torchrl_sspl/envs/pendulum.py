@@ -104,7 +104,6 @@ class PixelPendulumEnv(SafetyEnv):
         if integrator not in _INTEGRATORS:
             raise ConfigError(f"integrator: expected one of {list(_INTEGRATORS)}, received {integrator!r}.")
         check_positive(max_torque=max_torque, mass=mass, length=length, gravity=gravity, dt=dt)
-        renderer = PendulumRenderer(image_size, snap=snap, device=device)
         turn = [2 * math.pi, 0.0]
         if state_space is None:
             state_space = Box([-math.pi, -3.5], [math.pi, 3.5], period=turn)
@@ -119,7 +118,12 @@ class PixelPendulumEnv(SafetyEnv):
         )  # fmt: skip
         self.integrator, self.max_torque = integrator, float(max_torque)
         self.mass, self.length, self.gravity, self.dt = mass, length, gravity, dt
-        self._renderer = renderer
+        self._snap = snap
+        _ = self._renderer  # a size that is not valid is named at once
+
+    @functools.cached_property
+    def _renderer(self) -> PendulumRenderer:
+        return PendulumRenderer(self.image_size, snap=self._snap, device=self.device)
 
     def dynamics(self, state: Tensor, action: Tensor) -> Tensor:
         """Next state ``(*batch, 2)`` (rad, rad/s) by the formula in the class docstring; the angle is not wrapped.

@@ -157,7 +157,7 @@ def write_metrics(outcome: Outcome) -> Path:
         "warnings": outcome.warnings,
         "config": config,
     }
-    text = json.dumps(without_paths(_finite(body)), indent=1, sort_keys=True, allow_nan=False) + "\n"
+    text = json.dumps(without_paths(finite(body)), indent=1, sort_keys=True, allow_nan=False) + "\n"
     path = Path(outcome.directory) / METRICS_FILE
     write(path, text)
     beside = path.parent / "agent"
@@ -166,12 +166,17 @@ def write_metrics(outcome: Outcome) -> Path:
     return path
 
 
-def _finite(value: Any) -> Any:
-    """None for what JSON has no number for."""
+def finite(value: Any) -> Any:
+    """None for what JSON has no number for. Source: none.
+
+    Example:
+        >>> finite({"a": [1.0, float("nan")]})
+        {'a': [1.0, None]}
+    """
     if isinstance(value, Mapping):
-        return {k: _finite(v) for k, v in value.items()}
+        return {k: finite(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_finite(v) for v in value]
+        return [finite(v) for v in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 

@@ -353,7 +353,6 @@ def _in_world(
 ) -> Episodes:
     """One episode in a gymnasium environment, up to the first of: steps are over, it terminates, falls, or leaves."""
     record, alive = _Record(watch), torch.ones(1, dtype=torch.bool)
-    events = dict.fromkeys(EVENTS, False)
 
     def shown(observation: Any, info: dict[str, Any]) -> Tensor:
         return torch.as_tensor(info["pose"] if acts.reads == "state" else observation)[None]
@@ -369,7 +368,7 @@ def _in_world(
     observation, info = env.reset(seed=seed, **options)
     decision = acts.step(shown(observation, info))
     keep(observation, info, decision)
-    events["entered"] = bool(info.get("unsafe"))
+    events = {name: bool(info.get(entry)) for name, entry in EVENTS.items()}  # the reset walks a step, too
     for t in range(horizon):
         before = decision
         observation, _, terminated, truncated, info = env.step(decision.action[0].numpy())

@@ -149,7 +149,7 @@ def _of_states(arrays: dict[str, Any], barrier: Any, env: SafetyEnv) -> dict[str
     episodes = arrays.get("walks")
     if plane is not None and episodes is not None and episodes.states is not None:
         wrong = torch.stack([happened for name, happened in episodes.events.items() if name != "left"]).any(0)
-        text = f"{len(wrong)} walks in full physics; dots: where they start; red: those that hit, fall or enter U. {_leaving(twin)}"
+        text = f"walks in full physics; dots: where they start; red: those that hit, fall or enter U. {_leaving(twin)}"
         figures["Walks in full physics"] = walks(plane, episodes.states, episodes.alive, wrong, caption=text)
     generator = torch.Generator().manual_seed(0)
     regions = (env.safe_set, env.state_space, env.unsafe_set)

@@ -395,13 +395,13 @@ class Experiment:
                 found[name] = evaluate(agent, twin, e, draw=draw, episodes=e.renderer_episodes, progress=progress)
             except MissingDependencyError as error:
                 tqdm.write(f"not evaluated on the frames of {name}: {error}")
-        if e.walks and twin.physics() is not None:
-            try:
+        try:
+            if e.walks and twin.physics() is not None:
                 walks, self.walks = evaluate_physics(agent, twin, e, progress=progress)
                 found["own"].measurements |= walks.measurements
                 found["own"].arrays |= walks.arrays
-            except MissingDependencyError as error:
-                tqdm.write(f"not evaluated in full physics: {error}")
+        except MissingDependencyError as error:
+            tqdm.write(f"not evaluated in full physics: {error}")
         return found
 
     def certify(self, agent: Agent) -> Certificate:

@@ -6,6 +6,7 @@ import dataclasses
 import functools
 import math
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -116,6 +117,7 @@ class ViabilityKernel:
         outside: whether states beyond the grid belong to the set.
         iterations, seconds: of the computation.
         change: largest change of a value in the last iteration, as a share of the largest value.
+        converged: whether that is within the tolerance; if not, a kernel is too large.
     """
 
     value: Tensor
@@ -125,6 +127,7 @@ class ViabilityKernel:
     iterations: int
     seconds: float
     change: float
+    converged: bool = True
 
     @property
     def axes(self) -> list[Tensor]:
@@ -199,7 +202,7 @@ def viability_kernel(
         errors: ``(j, d)`` errors e, of which the worst is added to every successor, which stays in the box by that. Default: none.
         saturation: share of the largest value of ``l`` at which it is cut, above and below.
         tolerance: stop when no value changes by more than this share of the cut.
-        max_iterations: stop at the latest after so many iterations.
+        max_iterations: stop at the latest after so many iterations, with a warning.
 
     Returns:
         The kernel. That of the pendulum at the default resolution takes two seconds on one core.
@@ -227,7 +230,13 @@ def viability_kernel(
         )
     cut = float(problem.margin.max()) * saturation
     problem.margin = limit = problem.margin.clamp(-cut, cut)
-    return _iterate(problem, limit, lambda _, best: torch.minimum(limit, best), cut, tolerance, max_iterations)
+    kernel = _iterate(problem, limit, lambda _, best: torch.minimum(limit, best), cut, tolerance, max_iterations)
+    if not kernel.converged:
+        warnings.warn(
+            f"the kernel still changes by {kernel.change:.2g} of the cut after {kernel.iterations} iterations, more than the tolerance of {tolerance:g}: "
+            "it is too large; raise max_iterations", stacklevel=2,
+        )  # fmt: skip
+    return kernel
 
 
 def _iterate(
@@ -260,7 +269,7 @@ def _iterate(
     save(complete=True)
     grid, seconds = problem.grid, time.perf_counter() - start
     value, margin = value.reshape(grid.shape), problem.margin.reshape(grid.shape)
-    return ViabilityKernel(value, margin, grid, problem.exit_is_safe, iterations, seconds, change)
+    return ViabilityKernel(value, margin, grid, problem.exit_is_safe, iterations, seconds, change, change <= tolerance)
 
 
 def recoverable_set(

@@ -266,7 +266,7 @@ def trajectories(
         action_name: name and unit of the action.
         action_direction: direction in the plane of a positive action (the pendulum's torque pushes the angular
             velocity: ``(0, 1)``); None: along the path.
-        action_scale: action with the longest arrow; default: the largest.
+        action_scale: action of an arrow of full length; default: the largest of those episodes.
         dt: time step in s; None: the time axis counts steps.
         episodes: trajectories drawn at most, with starts far apart.
         arrows: arrows per trajectory, at most.
@@ -291,10 +291,10 @@ def trajectories(
     last = np.full(n, steps) if lengths is None else array("lengths", lengths, (n,)).astype(int).clip(1, steps)
     extent = np.array([plane.high[k] - plane.low[k] for k in plane.coords])
     chosen = _spread(x[0][:, list(plane.coords)] / extent, min(episodes, n))
-    largest = action_scale or max(float(np.abs(u).max()), 1e-12)
+    largest = action_scale or max(1e-12, *(float(np.abs(u[: last[k], k]).max()) for k in chosen))
     caption = (caption or f"{len(chosen)} trajectories of the learned policy").rstrip(".")
     drawn = "" if background is None else plane.rest()
-    figure = new_figure(10.5, 5.0, f"{caption}; the longest arrow is {largest:.3g} ({action_name}).{drawn}")
+    figure = new_figure(10.5, 5.0, f"{caption}; an arrow of full length is {largest:.3g} ({action_name}).{drawn}")
     grid = figure.add_gridspec(2, 2, width_ratios=(1.25, 1))
     ax = figure.add_subplot(grid[:, 0])
     handles = _draw_sets(ax, plane, x[:, chosen][..., list(plane.coords)].reshape(-1, 2), background)

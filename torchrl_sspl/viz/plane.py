@@ -192,11 +192,30 @@ class Plane:
                 axis.set_ticks(list(shown_marks), list(shown_marks.values()))
 
     def set_handles(self, *, beyond: bool = False) -> list[Any]:
-        """Legend entries of the areas and of the obstacle, ``beyond``: of what lies outside the state space too."""
+        """Legend entries of the areas and of the obstacle, ``beyond``: of what lies outside the state space too.
+
+        Of a set that depends on coordinates which are neither shown nor fixed it is said that these are in the middle of their range.
+        """
         patch = require("matplotlib.patches").Patch
-        areas = [("S", SAFE_FILL, self.safe_set is not None), ("U", UNSAFE_FILL, self.unsafe_set is not None)]
+        areas = [
+            (name + (" (rest mid-range)" if self._varies(region) else ""), colour, region is not None)
+            for name, colour, region in (("S", SAFE_FILL, self.safe_set), ("U", UNSAFE_FILL, self.unsafe_set))
+        ]
         areas += [("obstacle", OBSTACLE_FILL, self.obstacle is not None), ("beyond the space", OUTSIDE_FILL, beyond)]
         return [patch(facecolor=c, edgecolor="#9a9a9a", linewidth=0.5, label=s) for s, c, drawn in areas if drawn]
+
+    def _varies(self, region: Region | None) -> bool:
+        """Whether a set is another one at other values of the coordinates that are neither shown nor fixed."""
+        free = [k for k in self.hidden if k not in self.fixed]
+        if region is None or not free:
+            return False
+        low, high = torch.tensor(self.low), torch.tensor(self.high)
+        state = low + (high - low) * torch.rand(4000, self.dim, generator=torch.Generator().manual_seed(0))
+        for k, value in self.fixed.items():
+            state[:, k] = value
+        drawn = state.clone()
+        drawn[:, free] = ((low + high) / 2)[free]
+        return bool((region.contains(state) != region.contains(drawn)).any())
 
     def grid(
         self, states: Any, values: dict[str, Any], reduce: str = "max"

@@ -109,7 +109,7 @@ def walks(plane: Plane, states: Any, alive: Any, wrong: Any, *, limit: int = 60,
         states: ``(T + 1, n, dim)`` true states.
         alive, wrong: ``(T + 1, n)`` whether a state belongs to its episode, ``(n,)`` whether an episode went wrong.
         limit: paths drawn at most; those that went wrong first.
-        caption: what is shown.
+        caption: what is shown; how many are is said before it.
 
     Raises ConfigError without any episode; ShapeError or NonFiniteError for arguments that do not fit. Source: paper
     Section V, figure "traj_sspl_gr"; deviation: the paths of all episodes, not of a few.
@@ -130,7 +130,8 @@ def walks(plane: Plane, states: Any, alive: Any, wrong: Any, *, limit: int = 60,
     spread = min(max(0, limit - len(worse)), len(good))
     drawn = worse[:limit] + [good[k * len(good) // spread] for k in range(spread)]
     paths = {k: array("states", x[held[:, k], k], (None, 2)) for k in drawn}
-    figure = new_figure(5.6, 5.6, caption or f"{len(drawn)} of {n} walks in full physics; dots: where they start.")
+    told = f"{n}" if len(drawn) == n else f"{len(drawn)} of {n}" + (", those that went wrong first" if bad.any() else "")
+    figure = new_figure(5.6, 5.6, f"{told}: {caption or 'walks in full physics; dots: where they start.'}")
     ax = figure.add_subplot()
     plane.draw(ax, cover=np.concatenate(list(paths.values())))
     for count, (k, path) in enumerate(paths.items()):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from torchrl_sspl.envs.base import check_positive
+from torchrl_sspl.envs.base import check_positive, numbers
 from torchrl_sspl.errors import ConfigError
 
 _SHAPES = ("square", "disc")
@@ -31,9 +31,9 @@ def check_arena(
         arena_half_size=arena_half_size, safe_half_size=safe_half_size, unsafe_half_size=unsafe_half_size,
         obstacle_half_size=obstacle_half_size,
     )  # fmt: skip
-    centre = [float(v) for v in obstacle_centre]
+    centre = numbers(obstacle_centre)
     if len(centre) != 2 or not all(abs(v) <= arena_half_size for v in centre):
-        raise ConfigError(f"obstacle_centre: expected (x, y) inside the arena, received {list(obstacle_centre)}.")
+        raise ConfigError(f"obstacle_centre: expected (x, y) inside the arena, received {obstacle_centre!r}.")
     if not obstacle_half_size <= unsafe_half_size < safe_half_size < arena_half_size + max(map(abs, centre)):
         raise ConfigError(
             "sizes: expected obstacle <= unsafe < safe < arena, received "

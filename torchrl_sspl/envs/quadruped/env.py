@@ -17,7 +17,7 @@ from torchrl_sspl.envs.quadruped.controller import Measurement
 from torchrl_sspl.envs.quadruped.robot import Snapshot, WalkingRobot
 from torchrl_sspl.envs.quadruped.stage import StageProcess
 from torchrl_sspl.envs.quadruped.world import GROUND_FRICTION, add_obstacle, connect
-from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
+from torchrl_sspl.errors import ConfigError, DTypeError, NonFiniteError, ShapeError
 
 _RENDER_SIZE = 512
 
@@ -122,12 +122,14 @@ class QuadrupedEnv(gymnasium.Env):
         """Start: the robot walks straight ahead, in a steady gait, at a pose; frames and info as in ``step``.
 
         Options: "pose", (x, y, heading) [m, m, rad], default uniform in S; "phase", of the gait in [0, 1), default
-        uniform. Raises ConfigError for others; ShapeError or NonFiniteError unless the pose is three finite numbers.
+        uniform. Raises ConfigError for others, and after ``close``; ShapeError, DTypeError or NonFiniteError unless the pose is three
+        finite numbers and the phase one; RenderError where the camera does not see the robot.
         """
+        self._open()
         super().reset(seed=seed)
         given = dict(options or {})
         pose = given.pop("pose", None)
-        phase = float(given.pop("phase", self.np_random.random()))
+        (phase,) = _numbers("phase", given.pop("phase", self.np_random.random()), 1)
         if given:
             raise ConfigError(f"options: expected 'pose' and 'phase', received {sorted(given)}.")
         x, y, heading = self._start() if pose is None else _numbers("pose", pose, 3)
@@ -146,10 +148,11 @@ class QuadrupedEnv(gymnasium.Env):
         """Walk for ``dt`` at a yaw rate ``(1,)`` in rad/s.
 
         Returns frames uint8 ``(6, H, W)``, one step ago and now, reward (minus the cost), terminated (fallen, or left
-        the arena), False, info. Raises ConfigError if the episode was not started; ShapeError or NonFiniteError, and
-        nothing moves, unless the action is one finite number; SolverError if the controller found no forces many times
+        the arena), False, info. Raises ConfigError if the episode was not started, and after ``close``; ShapeError, DTypeError or
+        NonFiniteError, and nothing moves, unless the action is one finite number; SolverError if the controller found no forces many times
         in a row.
         """
+        self._open()
         if self._frames is None:
             raise ConfigError("step: expected a reset before the first step, received none; call reset().")
         (rate,) = _numbers("action", action, 1)
@@ -175,8 +178,8 @@ class QuadrupedEnv(gymnasium.Env):
         "buffer"."""
         centre = self.obstacle_centre.tolist()
         areas = [
-            (self.arena_half_size, (0.0, 0.0), colours["S"]), (self.safe_half_size, centre, colours["buffer"]),
-            (self.unsafe_half_size, centre, colours["U"]),
+            ("square", self.arena_half_size, (0.0, 0.0), colours["S"]), ("square", self.safe_half_size, centre, colours["buffer"]),
+            (self.obstacle_shape, self.unsafe_half_size, centre, colours["U"]),
         ]  # fmt: skip
         shape, half = self.obstacle_shape, self.obstacle_half_size
         return StageProcess(size, obstacle_shape=shape, obstacle_half_size=half, obstacle_centre=centre, areas=areas)
@@ -186,6 +189,10 @@ class QuadrupedEnv(gymnasium.Env):
         if self._client is not None:
             self._client.disconnect()
             self._client = None
+
+    def _open(self) -> None:
+        if self._client is None:
+            raise ConfigError("expected an environment that is open, received one after close(); make another one.")
 
     def _walk(self, rate: float) -> bool:
         """Simulate one step at a yaw rate; whether the obstacle was touched."""
@@ -231,7 +238,10 @@ class QuadrupedEnv(gymnasium.Env):
 
 def _numbers(name: str, value: Any, n: int) -> list[float]:
     """n finite numbers."""
-    array = np.asarray(value, dtype=np.float64).reshape(-1)
+    try:
+        array = np.asarray(value, dtype=np.float64).reshape(-1)
+    except (TypeError, ValueError) as error:
+        raise DTypeError(f"{name}: expected {n} number(s), received {value!r}.") from error
     if array.shape != (n,):
         raise ShapeError(f"{name}: expected {n} number(s), received shape {np.shape(value)}.")
     if not np.isfinite(array).all():

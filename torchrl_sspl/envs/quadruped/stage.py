@@ -24,6 +24,7 @@ from torchrl_sspl.envs.quadruped.robot import WalkingRobot
 from torchrl_sspl.envs.quadruped.world import add_obstacle, connect
 
 Colour = tuple[int, int, int]
+Area = tuple[str, float, Sequence[float], Colour]
 _BEHIND, _HEIGHT, _AHEAD, _FOV = 1.55, 1.05, 0.55, 48.0  # m behind and above the robot, m ahead where it looks, degrees
 _FOLLOW, _ASIDE = 0.8, 0.3  # s, in which the camera turns after the robot; rad, by which it stands aside
 _SKY, _GRID, _OUTSIDE = (np.array(c, np.float32) for c in ((233, 239, 245), (190, 197, 204), (226, 229, 233)))
@@ -38,12 +39,12 @@ _LIGHT: dict[str, Any] = {
 
 
 class Stage:
-    """A robot with its meshes and an obstacle, on a ground on which squares are drawn; nothing moves by itself.
+    """A robot with its meshes and an obstacle, on a ground on which areas are drawn; nothing moves by itself.
 
     Args:
         size: height and width of the pictures.
         obstacle_shape, obstacle_half_size, obstacle_centre: as of ``QuadrupedEnv``, in m.
-        areas: squares on the ground, the largest first: half size in m, centre (x, y) in m, colour.
+        areas: on the ground, the largest first: "square" or "disc", half size or radius in m, centre (x, y) in m, colour.
 
     Raises MissingDependencyError without PyBullet, its data or its meshes. Source: none (the paper shows pictures of the
     robot).
@@ -60,7 +61,7 @@ class Stage:
         obstacle_shape: str = "square",
         obstacle_half_size: float = 0.3,
         obstacle_centre: Sequence[float] = (0.0, 0.0),
-        areas: Sequence[tuple[float, Sequence[float], Colour]] = (),
+        areas: Sequence[Area] = (),
     ) -> None:
         self.size = size
         self._client = connect()
@@ -71,7 +72,7 @@ class Stage:
             colour = next((c for part, c in _LIMBS.items() if f"_{part}_" in name), _TRUNK)
             self._client.changeVisualShape(self._robot.body_id, link, rgbaColor=colour)
         self._projection = self._client.computeProjectionMatrixFOV(_FOV, 1.0, 0.05, 30.0)
-        self._half = _FAR_AWAY / 2 + max((half for half, _, _ in areas), default=0.0)
+        self._half = _FAR_AWAY / 2 + max((half for _, half, *_ in areas), default=0.0)
         self._ground = self._paint(areas)
         self._forward, self._left, self._fade = self._rays()
         far = np.hypot(self._forward, self._left)
@@ -134,16 +135,17 @@ class Stage:
         lit = self._ground[self._blur, row, column] * shade[..., None]
         return lit + self._fade * (_SKY - lit)
 
-    def _paint(self, areas: Sequence[tuple[float, Sequence[float], Colour]]) -> NDArray[np.uint8]:
+    def _paint(self, areas: Sequence[Area]) -> NDArray[np.uint8]:
         """The ground from above, row 0 in the south; sharp, and blurred twice for what is far away."""
         n = round(2 * self._half / _TEXEL)
         at = (np.arange(n) + 0.5) * _TEXEL - self._half
         ground = np.full((n, n, 3), _OUTSIDE, np.float32)
-        inside = np.ones(n, bool), np.ones(n, bool)
-        for k, (half, centre, colour) in enumerate(areas):
-            square = [np.abs(at - centre[i]) <= half for i in (0, 1)]
-            inside = (square[0], square[1]) if k == 0 else inside  # nothing reaches beyond the first one
-            ground[np.ix_(square[1] & inside[1], square[0] & inside[0])] = colour
+        arena = np.ones((n, n), bool)  # nothing reaches beyond the first one
+        for k, (shape, half, centre, colour) in enumerate(areas):
+            east, north = np.abs(at - centre[0])[None], np.abs(at - centre[1])[:, None]
+            inside = (np.hypot(east, north) if shape == "disc" else np.maximum(east, north)) <= half
+            arena = inside if k == 0 else arena
+            ground[inside & arena] = colour
         line = np.abs((at + _TILE / 2) % _TILE - _TILE / 2) <= _LINE
         for part in (line, (slice(None), line)):
             ground[part] += 0.6 * (_GRID - ground[part])
