@@ -194,6 +194,13 @@ def test_options_may_stand_between_the_words_of_an_evaluation(monkeypatch, tmp_p
     assert (tmp_path / "f.json").is_file()
 
 
+def test_the_measurements_of_an_evaluation_are_json_that_every_reader_takes(monkeypatch, tmp_path):
+    found = types.SimpleNamespace(measurements={}, to_dict=lambda: {"x": {"value": float("nan")}})
+    monkeypatch.setattr(cli, "evaluate_agent", lambda *a, **k: found)
+    assert cli.main(["evaluate", "pendulum", "--json", str(tmp_path / "f.json")]) == 0
+    assert json.loads((tmp_path / "f.json").read_text()) == {"x": {"value": None}}
+
+
 def stand_in(monkeypatch, name, **members):
     module = types.ModuleType(name)
     vars(module).update(members)

@@ -10,8 +10,8 @@ import torch
 
 from torchrl_sspl.baselines import make, scoring
 from torchrl_sspl.baselines.__main__ import main
-from torchrl_sspl.baselines.base import BUDGETS, Budget, Needs
-from torchrl_sspl.baselines.cell import ROW_FILE, SCHEMA, TRIALS_FILE, Cell, _tuned, run_cell, stored, text
+from torchrl_sspl.baselines.base import BUDGETS, EARLIER, Budget, Needs
+from torchrl_sspl.baselines.cell import ROW_FILE, SCHEMA, TRIALS_FILE, Cell, _fit, _tuned, run_cell, stored, text
 from torchrl_sspl.baselines.data import pooled, record
 from torchrl_sspl.configs.reader import FOLDER
 from torchrl_sspl.envs import PendulumEnv
@@ -44,6 +44,16 @@ def test_another_row_is_never_overwritten(tmp_path):
         run_cell(Cell.of("hocbf", [where, *SMALL]))
     with pytest.raises(OutputError, match="choose another out_dir"):
         run_cell(Cell.of("lqr", [where, *SMALL[1:]]))
+
+
+def test_the_row_of_an_agent_is_no_other_row_and_is_not_overwritten_by_one(tmp_path):
+    where = f"out_dir={tmp_path}/row"
+    agent = Cell.of("sspl", ["agent=pendulum", where, *SMALL])
+    agent.directory.mkdir()
+    for there, asked in ((Cell.of("lqr", [where, *SMALL]), agent), (agent, Cell.of("lqr", [where, *SMALL])), (agent, Cell.of("sspl", ["agent=quadruped", where, *SMALL]))):
+        (agent.directory / ROW_FILE).write_text(json.dumps({"schema": SCHEMA, "cell": there.describe()}))
+        with pytest.raises(OutputError, match="choose another out_dir"):
+            run_cell(asked)
 
 
 def test_a_row_of_an_agent_with_other_weights_is_measured_again(tmp_path):
@@ -105,6 +115,15 @@ def test_a_row_of_a_file_is_that_of_its_content(tmp_path, monkeypatch):
         ("nothing", [], "expected a method"),
         ("lqr", ["budget=huge"], "expected budget to be one of tiny, small, full"),
         ("lqr", ["seed=-1"], "expected seed to be an integer"),
+        ("lqr", ["seed=\u00b2"], "expected seed to be an integer"),
+        ("lqr", [f"seed={2**62}"], "expected seed to be an integer"),
+        ("latent_safe", ["trials=\u00b2"], "expected trials to be an integer"),
+        ("lqr", [f"score.seed={2**62}"], r"score\.seed: expected an integer in"),
+        ("latent_safe", ["tau=7"], r"latent_safe: expected tau in \(0, 1\], received 7.0"),
+        ("latent_safe", ["discount=1.0"], r"latent_safe: expected discount in \[0, 1\), received 1.0"),
+        ("latent_cbf", ["alpha=1.5"], r"latent_cbf: expected alpha in \[0, 1\), received 1.5"),
+        ("nerf_cbf", ["beta=-1"], "nerf_cbf: expected beta >= 0, received -1.0"),
+        ("cone", ["radius=-1"], "cone: expected radius >= 0, received -1.0"),
         ("lqr", ["gain=1"], "expected options among"),
         ("lqr", ["score.episode=1"], "expected score"),
         ("lqr", ["noise"], "key=value"),
@@ -189,6 +208,33 @@ def test_a_training_on_a_system_without_recommended_settings_is_refused(tmp_path
         run_cell(Cell.of("sspl", ["env=cmu", f"out_dir={tmp_path}", *SMALL]))
 
 
-def test_a_discount_that_is_none_is_refused():
-    with pytest.raises(ConfigError, match=r"latent_safe: expected discount in \[0, 1\), received 1.5"):
-        make("latent_safe", ["discount=1.5"]).fit(None, PendulumEnv(), BUDGETS["tiny"], 0)
+def test_a_method_learns_from_and_is_shown_pictures_of_the_size_that_it_is_given(monkeypatch):
+    words = ["env=dubins", "budget=tiny", "world_steps=2", "margin_steps=2", "steps=2"]
+    shown = []
+    for pixels, side in (([], 32), (["pixels=64"], 64)):
+        cell = Cell.of("latent_safe", [*words, *pixels])
+        env, method = cell.environment(), make("latent_safe", cell.options)
+        _fit(method, env, cell, 0)
+        assert method.side == method.encoder.pool_to[0] == side
+        monkeypatch.setattr(method, "barrier", lambda seen: shown.append(seen.shape[-1]))
+        scoring.barrier_on(method, env, torch.zeros(2, 3))
+        monkeypatch.setattr(method, "act", lambda seen, wanted: (shown.append(seen.shape[-1]), (wanted, torch.zeros(len(wanted), dtype=torch.bool)))[1])
+        scoring.paths(method, env, torch.zeros(2, 3), scoring.harmless(env), 1)
+    assert shown == [32, 32, 64, 64]
+    assert make("latent_cbf").side == 32
+    assert make("sspl").side is None
+    with pytest.raises(ConfigError, match="pixels: expected at most 64, the size of the system's pictures, received 128"):
+        record(PendulumEnv([8]), BUDGETS["tiny"], 0, size=128)
+
+
+def test_a_training_of_another_version_is_not_gone_on_with(tmp_path):
+    method = make("sspl")
+    path = tmp_path / "cpu.json"
+    path.write_text(json.dumps({"seconds": 3.0}))
+    with pytest.raises(OutputError, match=rf"expected a training of schema {SCHEMA}.*remove that folder"), method._timed(path):
+        pass
+    path.unlink()
+    for _ in range(2):
+        with method._timed(path):
+            assert json.loads(path.read_text())["schema"] == SCHEMA
+    assert method.notes[EARLIER] >= 0.0

@@ -295,6 +295,7 @@ def test_an_agent_that_was_trained_before_has_a_budget_of_its_own():
         (["methods=lqr", "score.grid=-3"], r"score\.grid: expected >= 2, or 0 for the default, received -3"),
         (["methods=lqr", "score.check_episodes=-1"], r"score\.check_episodes: expected >= 0, received -1"),
         (["methods=lqr", "score.frames=0"], r"score\.frames: expected >= 1"),
+        (["methods=sspl:overrides=[a/b],sspl:overrides=[a_b]"], "expected cells of folders of their own, received two"),
     ],
 )
 def test_words_that_are_not_valid_are_refused(words, message):

@@ -115,3 +115,23 @@ def test_a_moved_system_keeps_its_states_and_makes_its_pictures_anew(kind):
     assert torch.equal(again["pixels"], shown["pixels"])
     with pytest.raises(ConfigError, match="device: expected a device"):
         env.to("cuda:99")
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: PendulumEnv(batch_size="a"), r"batch_size: expected \[n\].* received 'a'"),
+        (lambda: PendulumEnv(batch_size=3.5), "batch_size: expected .* received 3.5"),
+        (lambda: PendulumEnv(seed="a"), "seed: expected an integer or None, received 'a'"),
+        (lambda: DubinsEnv(yaw_lag=3), "yaw_lag: expected two finite numbers .* received 3"),
+        (lambda: DubinsEnv(yaw_lag=("a", 1)), "yaw_lag: expected two finite numbers"),
+        (lambda: DubinsEnv(obstacle_centre="ab"), r"obstacle_centre: expected \(x, y\).* received 'ab'"),
+        (lambda: CMUDubinsEnv(background=3), r"background: expected red, green and blue in \[0, 1\], received 3"),
+        (lambda: CMUDubinsEnv(dot_area="a"), "dot_area: expected a finite number >= 0, received 'a'"),
+        (lambda: CMUDubinsEnv(image_size=8), "image_size: expected an integer >= 32"),
+        (lambda: PendulumEnv(image_size=8), "image_size: expected an integer >= 16"),
+    ],
+)
+def test_a_system_that_cannot_be_is_named_at_once(make, message):
+    with pytest.raises(ConfigError, match=message):
+        make()

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import ast
+import json
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -290,3 +292,21 @@ def test_a_lipschitz_constant_is_certified_only_where_it_was_proved():
     lipschitz(out, agent, torch.Generator().manual_seed(0))
     assert out["lipschitz_certified"] is None
     assert "refuted by a slope of" in out.measurements["lipschitz_certified"].note
+
+
+def test_what_is_safe_falsely_is_not_measured_against_a_kernel_that_is_too_large():
+    early = replace(kernel(), converged=False)
+    found = evaluate(Rival(lambda x: x[:, 0].abs() - 1.2), pendulum(), SMALL, kernel=early)
+    assert found["false_safe"] is found["false_safe_of_doomed"] is None
+    assert "has not converged" in found.measurements["false_safe"].note
+    assert found["volume_over_kernel"] > 0  # over one that is too large it is too small
+
+
+def test_of_an_empty_set_there_is_no_margin_of_the_dynamics():
+    agent = small_agent()
+    agent.barrier[-1].bias.data.fill_(9.0)
+    found = evaluate(agent, pendulum(), SMALL, kernel=kernel())
+    assert found["dynamics_margin"] is found["q3_with_margin"] is None
+    assert found["safety_margin"] > 0
+    assert found["q2_with_margin"] is not None
+    json.dumps(found.to_dict(), allow_nan=False)

@@ -370,3 +370,17 @@ def test_tensordict_policies_see_the_key_they_read():
 
     found = simulate(OnState(), PendulumEnv(seed=0, image_size=16), start=torch.tensor([[0.0, 0.5]]), horizon=1)
     assert found.actions.item() == -0.5
+
+
+def test_what_happens_in_a_reset_belongs_to_the_episode():
+    class Bumped(World):
+        def reset(self, *, seed=None, options=None):
+            observation, info = super().reset(seed=seed, options=options)
+            return observation, info | {"contact": True}
+
+    def still(pixels):
+        return torch.zeros(len(pixels), 1)
+
+    found = simulate(still, Bumped(), start=torch.tensor([[-1.8, -1.8, 0.0]]), horizon=2)
+    assert bool(found.events["hit"])
+    assert not bool(simulate(still, World(), start=torch.tensor([[-1.8, -1.8, 0.0]]), horizon=2).events["hit"])

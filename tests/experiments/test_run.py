@@ -467,3 +467,11 @@ def test_nothing_is_measured_where_that_is_asked_for(tmp_path):
     assert "policy_touch_unsafe" not in outcome.evaluation.measurements
     assert (tmp_path / "metrics.json").is_file()
     assert (tmp_path / "report.html").is_file()
+
+
+def test_a_run_whose_simulator_is_missing_is_evaluated_without_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "pybullet", None)
+    words = ["env=quadruped", "preset=smoke", "evaluation.episodes=0", "evaluation.renderer_episodes=0", "evaluation.walks=2", f"out_dir={tmp_path}/run"]
+    found = Experiment(compose(words)).evaluate(load("quadruped"))
+    assert found["own"].measurements == {}
+    assert "not evaluated in full physics: full physics: expected the simulator" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from torchrl_sspl.envs import DubinsEnv
-from torchrl_sspl.errors import ConfigError, MissingDependencyError, NonFiniteError, ShapeError, SolverError
+from torchrl_sspl.errors import ConfigError, DTypeError, MissingDependencyError, NonFiniteError, ShapeError, SolverError
 
 pytest.importorskip("pybullet")
 from torchrl_sspl.envs.quadruped import world
@@ -216,3 +216,17 @@ def test_unsolved_programs_fall_back_for_a_while_and_then_raise():
         walk(robot, 2000)
     assert robot.controller.mpc.failures > 1
     client.disconnect()
+
+
+def test_what_is_no_phase_and_no_pose_and_an_environment_that_is_closed_are_named(env):
+    for key, value, error in (("phase", "x", DTypeError), ("phase", math.nan, NonFiniteError), ("pose", "abc", DTypeError), ("pose", [0.0], ShapeError)):
+        with pytest.raises(error, match=f"{key}: expected"):
+            env.reset(options={key: value})
+    with pytest.raises(RenderError):
+        env.reset(options={"pose": [50.0, 0.0, 0.0]})
+    closed = QuadrupedEnv(image_size=16)
+    closed.reset(seed=0)
+    closed.close()
+    for call in (closed.reset, lambda: closed.step([0.0])):
+        with pytest.raises(ConfigError, match=r"received one after close\(\)"):
+            call()

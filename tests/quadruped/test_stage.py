@@ -52,3 +52,18 @@ def test_what_goes_wrong_in_the_other_process_is_raised_where_the_pictures_are_a
     with pytest.raises(RenderError, match="the end of the process"):
         next(killed.follow(bodies, 0.02))
     killed.close()
+
+
+def test_a_disc_is_painted_as_a_disc():
+    made = QuadrupedEnv(image_size=16, obstacle_shape="disc")
+    areas = {}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("torchrl_sspl.envs.quadruped.env.StageProcess", lambda size, **options: areas.update(options))
+        made.stage(16, {"S": (1, 1, 1), "U": (255, 0, 0), "buffer": (2, 2, 2)})
+    made.close()
+    stage = Stage(16, areas=areas["areas"])
+    at = [round((v + stage._half) / 0.01) for v in (0.43, 0.62)]  # off the lines on the ground
+    stage.close()
+    ground = stage._ground[0]
+    assert (ground[at[0], at[0]] == (255, 0, 0)).all()
+    assert (ground[at[1], at[1]] == (2, 2, 2)).all()  # .88 m from the middle of a disc of .7 m

@@ -228,3 +228,14 @@ def test_missing_and_bad_arguments_are_named():
         kernel.contains(torch.zeros(3, 1, dtype=torch.int64))
     with pytest.raises(ConfigError, match="horizon"):
         recoverable_set(still, kernel, horizon=-1, actions=torch.zeros(1, 1))
+
+
+def test_a_kernel_that_has_not_converged_says_so():
+    """x grows slowly whatever is done: nothing is viable, but the iteration comes from above."""
+    drift = dict(dynamics=lambda x, u: x + 5e-4, low=[-1.0], high=[1.0], resolution=41, margin=lambda x: 0.9 - x[:, 0].abs(), actions=torch.zeros(1, 1))
+    system = drift.pop("dynamics")
+    with pytest.warns(UserWarning, match="the kernel still changes by .* after 20 iterations.* raise max_iterations"):
+        kernel = viability_kernel(system, **drift, max_iterations=20)
+    assert not kernel.converged
+    assert kernel.volume_fraction > 0.5
+    assert viability_kernel(PendulumEnv(), resolution=31).converged

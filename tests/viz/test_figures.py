@@ -269,3 +269,12 @@ def test_figures_leave_pyplot_alone(plane, grid, disk):
     before = pyplot.get_fignums()
     state_plane(plane, grid, disk)
     assert pyplot.get_fignums() == before
+
+
+def test_an_arrow_of_full_length_is_the_largest_of_those_that_are_drawn(plane):
+    states, actions = torch.zeros(4, 3, 2), torch.ones(3, 3, 1)
+    actions[:, 0], actions[2, 1] = 9.0, 5.0  # not drawn: another episode, and a step after the end of this one
+    states[:, 1:] = torch.tensor([[-1.0, 0.0], [1.0, 0.0]])
+    drawn = trajectories(plane, states[:, 1:], actions[:, 1:], lengths=[2, 3])
+    assert "an arrow of full length is 1 (action)" in drawn.get_label()
+    assert "an arrow of full length is 9 (action)" in trajectories(plane, states, actions).get_label()

@@ -9,7 +9,7 @@ import torch
 
 pytest.importorskip("matplotlib")
 
-from torchrl_sspl.envs.dubins import DubinsEnv
+from torchrl_sspl.envs import CMUDubinsEnv, DubinsEnv
 from torchrl_sspl.errors import ConfigError, NonFiniteError, ShapeError
 from torchrl_sspl.viz import Plane, slices, walks
 
@@ -47,7 +47,9 @@ def test_a_third_coordinate_that_is_no_direction_has_no_arrow(plane):
 def test_walks_that_went_wrong_are_drawn_first_and_counted(plane):
     alive = torch.ones(4, 2, dtype=torch.bool)
     figure = walks(plane, straight(), alive, torch.tensor([False, True]), limit=1)
-    assert "1 of 2" in figure.get_label()
+    assert figure.get_label().startswith("1 of 2, those that went wrong first: walks in full physics")
+    assert walks(plane, straight(), alive, torch.zeros(2)).get_label().startswith("2: walks in full physics")
+    assert walks(plane, straight(), alive, torch.zeros(2), limit=1, caption="Paths").get_label() == "1 of 2: Paths"
     assert any("went wrong (1)" in text.get_text() for text in figure.legends[0].get_texts())
     with pytest.raises(ConfigError, match="walks"):
         walks(plane, torch.zeros(4, 0, 3), torch.zeros(4, 0, dtype=torch.bool), torch.zeros(0))
@@ -66,3 +68,9 @@ def test_a_walk_ends_where_it_is_no_longer_alive(plane):
         walks(plane, states, alive, torch.zeros(3))
     with pytest.raises(ShapeError, match="wrong"):
         walks(plane, straight(3), alive, torch.zeros(2))
+
+
+def test_a_set_that_depends_on_the_heading_is_said_to_be_drawn_at_one():
+    names, env = ("x [m]", "y [m]"), CMUDubinsEnv(image_size=32)
+    labels = [[h.get_label() for h in Plane.of(e, names, fixed=fixed).set_handles()] for e, fixed in ((env, {}), (env, {2: 1.0}), (DubinsEnv(image_size=32), {}))]
+    assert labels == [["S (rest mid-range)", "U", "obstacle"], ["S", "U", "obstacle"], ["S", "U", "obstacle"]]

@@ -152,9 +152,9 @@ class QuadrupedEnv(gymnasium.Env):
         NonFiniteError, and nothing moves, unless the action is one finite number; SolverError if the controller found no forces many times
         in a row.
         """
-        self._open()
         if self._frames is None:
             raise ConfigError("step: expected a reset before the first step, received none; call reset().")
+        self._open()
         (rate,) = _numbers("action", action, 1)
         contact = self._walk(min(max(rate, -self.max_yaw_rate), self.max_yaw_rate))
         info = self._info(contact)
