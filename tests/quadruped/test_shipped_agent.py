@@ -9,11 +9,14 @@ import torch
 
 import torchrl_sspl as sspl
 from torchrl_sspl.certification import Budget, Certificate
+from torchrl_sspl.configs import compose
 from torchrl_sspl.envs.dubins import YAW_LAG, DubinsEnv
+from torchrl_sspl.envs.system import Requirement, bounded
 from torchrl_sspl.evaluation import simulate, verify_run
 from torchrl_sspl.evaluation.beside import CERTIFICATE_FILE
 from torchrl_sspl.evaluation.certify import _is_proved
 from torchrl_sspl.evaluation.known import encode_states
+from torchrl_sspl.evaluation.measurements import Evaluation, Measurement, share
 from torchrl_sspl.modules.agent import agent_directory
 
 
@@ -88,3 +91,22 @@ def test_its_evaluation_names_settings_and_seed():
     assert body["preset"] == "sound"
     assert body["measurements"]["own"]["walks_from_set_enter"]["n"] == 200
     assert body["config"]["env"]["yaw_lag"] == list(YAW_LAG)
+
+
+@pytest.mark.parametrize("name", ["pendulum", "quadruped"])
+def test_verdicts_beside_an_agent_are_those_of_its_measurements(name):
+    body = json.loads((agent_directory(name) / "evaluation.json").read_text())
+    expected = {}
+    for where, found in body["measurements"].items():
+        measured = Evaluation({key: Measurement(**value) for key, value in found.items()})
+        for asked in body["requirements"]:
+            requirement = Requirement(*(asked[key] for key in ("name", "label", "sense", "must", "aim")))
+            if where == "own" or requirement.name in found:
+                label = requirement.label + ("" if where == "own" else f", {where} frames")
+                expected[label] = bounded(requirement, requirement.verdict(measured), measured.measurements.get(requirement.name))
+    assert body["verdicts"] == expected
+
+
+def test_a_run_has_as_many_walks_as_its_requirement_asks_for():
+    (must,) = [r.must for r in DubinsEnv(image_size=32).system.requirements if r.name == "walks_from_set_enter"]
+    assert share("walks", 0, compose(["env=quadruped"]).evaluation.walks).upper <= must

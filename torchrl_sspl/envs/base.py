@@ -295,14 +295,14 @@ class SafetyEnv(EnvBase):
         self._frame[rows] = pixels[:, 3:]
         self._steps[rows] = 0
         previous[rows] = pixels[:, :3]
-        return self._output(previous)
+        return _output(self, previous)
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         action = tensordict["action"].reshape(-1, self.action_dim).to(torch.float32)  # as the state, whatever computes actions
         self._state = self.wrap(self.dynamics(self._state, action))
         previous, self._frame = self._frame, self.draw(self._state)
         self._steps = self._steps + 1
-        out = self._output(previous)
+        out = _output(self, previous)
         shape = (*self.batch_size, 1)
         terminated = ~self.state_space.contains(self._state).reshape(shape)
         truncated = torch.zeros_like(terminated)
@@ -312,14 +312,16 @@ class SafetyEnv(EnvBase):
         out["terminated"], out["truncated"], out["done"] = terminated, truncated, terminated | truncated
         return out
 
-    def _output(self, previous_frame: Tensor) -> TensorDict:
-        shape, size = self.batch_size, self.image_size
-        return TensorDict(
-            {
-                "pixels": torch.cat([previous_frame, self._frame], dim=1).reshape(*shape, 6, size, size),
-                "state": self._state.clone().reshape(*shape, self.state_dim),
-                "region": self.region(self._state).reshape(*shape, 1),
-            },
-            batch_size=shape,
-            device=self.device,
-        )
+
+def _output(env: SafetyEnv, previous_frame: Tensor) -> TensorDict:
+    """What a step or a reset shows."""
+    shape, size = env.batch_size, env.image_size
+    return TensorDict(
+        {
+            "pixels": torch.cat([previous_frame, env._frame], dim=1).reshape(*shape, 6, size, size),
+            "state": env._state.clone().reshape(*shape, env.state_dim),
+            "region": env.region(env._state).reshape(*shape, 1),
+        },
+        batch_size=shape,
+        device=env.device,
+    )
