@@ -242,6 +242,7 @@ def test_several_seeds_are_a_mean_and_the_worst():
     assert "| 2.0 | nothing | nothing | invariance | ✗" in text
     tuned = row(0.5) | {"tuning": {"chosen": ["autoencoder_steps=1200", "alpha=0.5"], "needs": {"transitions": 9}}}
     assert "| ✗ ✗ ✗ ✗ ✓ ✗ | alpha=0.5 |" in markdown([(asked[0], tuned)])  # what is written out as it is by default is left out
+    assert "| latent_cbf | small | 0, and 9 of trials |" in markdown([(asked[0], tuned)])
     tuned["tuning"]["chosen"] = []
     assert "| the defaults |" in markdown([(asked[0], tuned)])
     assert "| nothing or [V] | nothing |" in markdown(list(zip(asked, [row(0.5), row(0.7, "[V]")], strict=True)))  # not of every seed

@@ -13,7 +13,8 @@ JUDGED = "tests/trainers/test_selection.py"
 SELECTION, AGENT = "torchrl_sspl/trainers/selection.py", "torchrl_sspl/modules/agent.py"
 SYNTHESIS, OWN = "torchrl_sspl/trainers/synthesis.py", "torchrl_sspl/baselines/sspl.py"
 
-TRIED, LEARNT, SHOWN = (f"tests/baselines/test_{name}.py" for name in ("tuning", "rivals", "table"))
+TRIED, LEARNT, SHOWN, CELLS = (f"tests/baselines/test_{name}.py" for name in ("tuning", "rivals", "table", "cells"))
+SLOW = "a slow test notices: test_a_signal_ends_the_processes_too"
 
 MUTANTS = [
     (BASE, "        torch.set_rng_state(state)\n", "", TRIED),
@@ -27,9 +28,9 @@ MUTANTS = [
     (TUNING, "published.items() if k not in named", "published.items() if True", TRIED),
     (TUNING, "[(), published] if published", "[()] if published", TRIED),
     (CELL, "minutes | {\"fit_cpu\": used / 60} | _of_trials(trials)", "minutes | {\"fit_cpu\": used / 60}", TRIED),
-    (TABLE, "            os._exit(128 + error.number)  #", "            pass  #", SHOWN),
-    (TABLE, "            child.terminate()", "            pass", SHOWN),
-    (TABLE, "    except Exception as error:", "    except SSPLError as error:", SHOWN),
+    (TABLE, "            os._exit(128 + error.number)  #", "            pass  #", f"{SHOWN}::test_a_signal_ends_the_command_and_what_is_done_stays", SLOW),
+    (TABLE, "            child.terminate()", "            pass", f"{SHOWN}::test_a_signal_ends_the_command_and_what_is_done_stays", SLOW),
+    (TABLE, "    except Exception as error:", "    except SSPLError as error:", f"{SHOWN}::test_an_error_of_any_kind_is_named_in_its_row_and_the_others_go_on"),
     (SCORING, "    if not len(check):", "    if False:", "tests/baselines/test_ceilings.py"),
     (SYNTHESIS, "range(s.near_draws)", "range(10)", LEARNT),
     (OWN, '"synthesis.near_draws=1", ', "", LEARNT),
@@ -38,7 +39,7 @@ MUTANTS = [
     (OWN, "steps = usual.trainer.optim_steps_per_batch * learning", "steps = usual.trainer.optim_steps_per_batch", f"{LEARNT}::test_this_librarys_own_row_takes_as_many_steps_as_recommended_whatever_the_budget"),
     (OWN, 'for how in ("labels", "chosen labels")) for name', 'for how in ("labels",)) for name', LEARNT),
     (CELL, "    if of != asked and {**of", "    if False and {**of", TRIED),
-    (TABLE, "if more := first.get", "if False and first.get", SHOWN),
+    (TABLE, "if more := first.get", "if False and first.get", f"{SHOWN}::test_several_seeds_are_a_mean_and_the_worst"),
     (PERCEPTION, "if isinstance(env, CMUDubinsEnv):", "if False:", f"{LEARNT}::test_the_encoder_of_a_car_of_one_colour_tells_its_heading"),
     (PERCEPTION, "ShapeEncoder(max(size, 4), pool_to=side) if whole else ", "", f"{LEARNT}::test_the_encoder_of_a_car_of_one_colour_tells_its_heading"),
     (PERCEPTION, "seen.flatten(1), torch.ones", "torch.ones", f"{LEARNT}::test_what_the_features_say_linearly_is_read_out_whatever_the_encoder_has_learnt"),
@@ -63,4 +64,10 @@ MUTANTS = [
     (AGENT, "    if not torch.allclose(one, other, equal_nan=True):", "    if False:", "tests/modules/test_agent.py"),
     (AGENT, "        if isinstance(value, nn.Module):\n            _built", "        if False:\n            _built", "tests/modules/test_agent.py"),
     (AGENT, "                agent.double()", "                pass", "tests/modules/test_agent.py"),
+    (CELL, ' and {**found, "weights": None, "score": None} == {**now, "weights": None, "score": None}:', ":", f"{CELLS}::test_the_row_of_an_agent_is_no_other_row_and_is_not_overwritten_by_one"),
+    (CELL, "cell.budget, seed, method.side or POOL) if method.learns", "cell.budget, seed, POOL) if method.learns", f"{CELLS}::test_a_method_learns_from_and_is_shown_pictures_of_the_size_that_it_is_given"),
+    (SCORING, "(state, shift, size=method.side):", "(state, shift):", f"{CELLS}::test_a_method_learns_from_and_is_shown_pictures_of_the_size_that_it_is_given"),
+    (SCORING, "pooled(frame(state), side))", "pooled(frame(state)))", f"{CELLS}::test_a_method_learns_from_and_is_shown_pictures_of_the_size_that_it_is_given"),
+    (OWN, 'if told.get("schema") != SCHEMA:', "if False:", f"{CELLS}::test_a_training_of_another_version_is_not_gone_on_with"),
+    (TABLE, "if found.setdefault(cell.directory, cell) != cell:", "found[cell.directory] = cell\n            if False:", f"{SHOWN}::test_words_that_are_not_valid_are_refused"),
 ]

@@ -33,7 +33,7 @@ from torchrl_sspl.trainers.phases import Check
 
 CPU_FILE = "cpu.json"  # of a training: s of the processor, and the schema of the version that began it
 BUDGET_FILE = "budget.json"  # of a training: what was counted of its data
-# The score's pictures have no noise to be steady under, and an error of one step adds up in a memory alone.
+# As recommended before pictures were changed: the score's have no noise to be steady under, and an error of one step adds up in a memory alone.
 _PLAIN = ["augmentation.share=0.0", "synthesis.steady_steps=0", "synthesis.dynamics_steps=1500", "synthesis.unsafe_margin=0.05"]
 # One round has no second one that mends it: its checks may move the set farther in, as with few labels.
 _ONE_ROUND = ["synthesis.rounds=1", "synthesis.lowest_level=-0.2", "synthesis.guard=0.005", "synthesis.safe_share=0.03"]
