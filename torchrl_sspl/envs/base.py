@@ -142,6 +142,8 @@ class SafetyEnv(EnvBase):
         batch_size = size
         if seed is not None and not isinstance(seed, int):
             raise ConfigError(f"seed: expected an integer or None, received {seed!r}.")
+        if not isinstance(image_size, int) or image_size < 1:
+            raise ConfigError(f"image_size: expected an integer >= 1, received {image_size!r}.")
         if horizon is not None and (not isinstance(horizon, int) or horizon < 1):
             raise ConfigError(f"horizon: expected an integer >= 1 or None, received {horizon!r}.")
         check_positive(max_action=max_action)
