@@ -224,9 +224,14 @@ def _album(env: str, system: str) -> Album:
     return Album(Cell("kernel", env).environment())
 
 
+def _data(method: SafetyMethod, cell: Cell, seed: int) -> Recording | None:
+    """What the method of a cell learns from, with the data of a seed; None if it takes no recording."""
+    return _recorded(cell.env, hash_of(cell.env), cell.budget, seed, method.side or POOL) if method.learns and method.records else None
+
+
 def _fit(method: SafetyMethod, env: SafetyEnv, cell: Cell, seed: int) -> None:
     """The method of a cell learns from the data of a seed."""
-    data = _recorded(cell.env, hash_of(cell.env), cell.budget, seed, method.side or POOL) if method.learns and method.records else None
+    data = _data(method, cell, seed)
     with torch.random.fork_rng():
         torch.manual_seed(spawn(seed, "weights"))
         method.fit(data, env, BUDGETS.get(cell.budget, BUDGETS["tiny"]), seed)
@@ -293,8 +298,7 @@ def run_cell(cell: Cell) -> dict[str, Any]:
         method = make(cell.method, [*cell.options, *chosen])
         method.directory, method.env_name = directory, cell.env
         clock = [time.perf_counter()]
-        if method.learns and method.records:
-            _recorded(cell.env, system, cell.budget, cell.seed, method.side or POOL)
+        _data(method, cell, cell.seed)  # its minutes are none of the fit's
         clock.append(time.perf_counter())
         used = time.process_time()
         _fit(method, env, cell, cell.seed)

@@ -162,8 +162,7 @@ class Plane:
             for b, c in zip((lower, upper), corners, strict=True)
         )
         extent = (float(lower[0]), float(upper[0]), float(lower[1]), float(upper[1]))
-        middles = [self.fixed.get(k, (self.low[k] + self.high[k]) / 2) for k in range(self.dim)]
-        state = torch.tensor(middles).repeat(resolution * resolution, 1)
+        state = self._middle().repeat(resolution * resolution, 1)
         # Centres of the pixels, so that an area ends where its set ends.
         middle = (torch.arange(resolution) + 0.5) / resolution
         y, x = torch.meshgrid(middle, middle, indexing="ij")
@@ -209,13 +208,17 @@ class Plane:
         free = [k for k in self.hidden if k not in self.fixed]
         if region is None or not free:
             return False
-        low, high = torch.tensor(self.low), torch.tensor(self.high)
-        state = low + (high - low) * torch.rand(4000, self.dim, generator=torch.Generator().manual_seed(0))
-        for k, value in self.fixed.items():
-            state[:, k] = value
-        drawn = state.clone()
-        drawn[:, free] = ((low + high) / 2)[free]
+        low, high, shown = torch.tensor(self.low), torch.tensor(self.high), list(self.coords)
+        anywhere = low + (high - low) * torch.rand(4000, self.dim, generator=torch.Generator().manual_seed(0))
+        drawn = self._middle().repeat(4000, 1)
+        drawn[:, shown] = anywhere[:, shown]
+        state = drawn.clone()
+        state[:, free] = anywhere[:, free]
         return bool((region.contains(state) != region.contains(drawn)).any())
+
+    def _middle(self) -> torch.Tensor:
+        """The state ``(dim,)`` at whose coordinates sets are drawn where these are not shown."""
+        return torch.tensor([self.fixed.get(k, (self.low[k] + self.high[k]) / 2) for k in range(self.dim)])
 
     def grid(
         self, states: Any, values: dict[str, Any], reduce: str = "max"
